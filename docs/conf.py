@@ -71,9 +71,12 @@ python_maximum_signature_line_length = 80
 
 # Names of other projects, whose references would need the network.
 nitpick_ignore_regex = [
-    ("py:.*", r"(np|numpy|pydrake|rich|distributed|pathlib|collections|enum|jinja2|numba)\..*"),
+    (
+        "py:.*",
+        r"(np|numpy|pydrake|rich|distributed|pathlib|collections|enum|jinja2|numba)\..*",
+    ),
     ("py:.*", r"(cv2|scipy|trimesh|asyncio|http|socketserver|PIL|xml|types|typing)\..*"),
-    ("py:.*", r"(functools|matplotlib|socket)\..*"),
+    ("py:.*", r"(functools|markupsafe|matplotlib|socket)\..*"),
     ("py:.*", r"cyclopts\..*"),
     # An argument that is raised, type variables, and names imported for type checkers only.
     ("py:exc", "error_type"),

@@ -46,6 +46,28 @@ class ClusterError(DrakePoseError):
     """Worker processes cannot be started or reached, or are unfit for the task."""
 
 
+class Weighted(str):
+    """A warning with a weight, see `weighted`."""
+
+    weight = "check"
+
+
+def weighted(warning: str, weight: str) -> str:
+    """Return a warning with a weight.
+
+    ``weight``: "wrong" if the answer is likely wrong; "check", as that of a plain str; or "note" if
+    it changes no answer.
+    """
+    text = Weighted(warning)
+    text.weight = weight
+    return text
+
+
+def weight_of(warning: str) -> str:
+    """Return the weight of a warning."""
+    return warning.weight if isinstance(warning, Weighted) else "check"
+
+
 @contextmanager
 def noted_warnings() -> Iterator[list[str]]:
     """Add warnings as notes to an error that is raised in this context.

@@ -30,6 +30,7 @@ from drake_pose import (
     save_cameras,
 )
 from drake_pose.camera.episode import JointLog
+from drake_pose.camera.servo_readings import Column
 from drake_pose.errors import (
     CameraError,
     SettingsError,
@@ -38,7 +39,7 @@ from drake_pose.errors import (
     noted_warnings,
 )
 from drake_pose.jobs.batch_tasks import describe_failure
-from drake_pose.jobs.registration.inputs import still_joints
+from drake_pose.jobs.registration.positions import still_joints
 from drake_pose.registration.register import RegistrationBody
 from drake_pose.search import BeamSearch
 
@@ -77,7 +78,7 @@ def test_a_single_name_is_a_collection_and_a_number_is_refused():
 
 def test_a_model_a_camera_or_a_tuple_where_others_are_expected_is_refused(model, tmp_path):
     search, view = MultiStartSearch(model.pose_tree()), View(CAMERA, np.ones((48, 64), bool))
-    a_model, a_camera = r"model\.pose_tree\(\).*ArticulatedModel, '", "one camera, 'c'"
+    a_model, a_camera = r"model\.pose_tree\(\).*ArticulatedModel, '", "one camera where"
     start = np.zeros(3), np.eye(3)
     table = [
         (a_model, lambda: MultiStartSearch(model)),
@@ -86,7 +87,7 @@ def test_a_model_a_camera_or_a_tuple_where_others_are_expected_is_refused(model,
         (a_camera, lambda: SilhouetteMatcher(search, CAMERA, 1.0)),
         (a_camera, lambda: save_cameras(tmp_path / "cameras.yaml", CAMERA)),
         (a_camera, lambda: PersonTracker(None, CAMERA, 1.0)),
-        ("str where a camera", lambda: SilhouetteMatcher(search, "c", 1.0)),
+        ("str where cameras", lambda: SilhouetteMatcher(search, "c", 1.0)),
         (r"\[view\]", lambda: search.match(view)),
         (
             "start must be a Belief.*not a tuple",
@@ -148,14 +149,15 @@ def test_an_error_carries_what_was_assumed_before():
 def test_joints_that_stand_still_while_others_move_are_named():
     def said(ranges):
         names = tuple(f"j{k}" for k in range(len(ranges)))
-        log = JointLog(names, None, np.linspace(0.0, 1.0, 9)[:, None] * ranges + 0.5)
+        rows = np.linspace(0.0, 1.0, 9)[:, None] * ranges + 0.5
+        log = JointLog(names, None, rows, columns=dict.fromkeys(names, Column("")))
         kinds = ("angle", "angle", "angle", "length")
         model = SimpleNamespace(position_kinds=kinds, position_index=names.index)
-        return still_joints(SimpleNamespace(mapped=SimpleNamespace(log=log), model=model))
+        return still_joints(log, model)
 
     (text,) = said([0.5, 1.0, 0.0, 0.7])
     assert text.startswith("joint 'j2' reads 0.5 in all rows")
     assert said([0.5, 0.0, 0.0, 0.7]) == said([0.5, 1.0, 1e-3, 0.7]) == ()
     # A gripper may stay as it is.
     assert said([0.5, 1.0, 0.7, 0.0]) == ()
-    assert still_joints(SimpleNamespace(mapped=None)) == ()
+    assert still_joints(None, SimpleNamespace()) == ()

@@ -328,8 +328,19 @@ def sanitise_sdf(
                 if mimic := take_mimic(axis, name, leaders if name in leaders else (), warn):
                     ElementTree.SubElement(joint, "drake:mimic", mimic)
     limits: Limits = {}
+    # Drake's parser does not read the limits of these joints.
+    suffixes = {"universal": {"axis": "_qx", "axis2": "_qy"}, "screw": {"axis": ""}}
     for joint in root.iter("joint"):
-        limits.update(_check_sdf_joint(joint))
+        name, kind = joint.get("name", "(unnamed)"), joint.get("type", "")
+        _check_poses(joint, f"joint '{name}'")
+        for axis in [*joint.findall("axis"), *joint.findall("axis2")]:
+            xyz = axis.findtext("xyz")
+            if xyz is not None and not any(read_numbers(xyz, 3, f"joint '{name}': its <xyz>")):
+                raise ModelError(f"joint '{name}': its axis is zero")
+            texts = [axis.findtext(f"limit/{side}") for side in ("lower", "upper")]
+            lower, upper = read_limits(texts[0], texts[1], name)
+            if axis.tag in suffixes.get(kind, {}) and lower is not None and upper is not None:
+                limits[f"{name}{suffixes[kind][axis.tag]}"] = (lower, upper)
     return xml_text(root), limits
 
 
@@ -375,28 +386,6 @@ def _check_sdf_visual(
         scale = shape.findtext("scale")
         if scale is not None:
             require_scale(scale, 3, f"{where}: scale of mesh '{name}'")
-
-
-def _check_sdf_joint(joint: ElementTree.Element) -> Limits:
-    """Refuse an SDFormat joint's invalid poses, axes and limits (ModelError).
-
-    Returns:
-        Limits (lower, upper) [rad] of universal and screw joints by position name, which Drake's
-        parser does not read; empty for other joints.
-    """
-    name, kind = joint.get("name", "(unnamed)"), joint.get("type", "")
-    _check_poses(joint, f"joint '{name}'")
-    suffixes = {"universal": {"axis": "_qx", "axis2": "_qy"}, "screw": {"axis": ""}}
-    unread: Limits = {}
-    for axis in [*joint.findall("axis"), *joint.findall("axis2")]:
-        xyz = axis.findtext("xyz")
-        if xyz is not None and not any(read_numbers(xyz, 3, f"joint '{name}': its <xyz>")):
-            raise ModelError(f"joint '{name}': its axis is zero")
-        texts = [axis.findtext(f"limit/{side}") for side in ("lower", "upper")]
-        lower, upper = read_limits(texts[0], texts[1], name)
-        if axis.tag in suffixes.get(kind, {}) and lower is not None and upper is not None:
-            unread[f"{name}{suffixes[kind][axis.tag]}"] = (lower, upper)
-    return unread
 
 
 # The inertia of bodies that have none.

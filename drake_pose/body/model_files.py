@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from pydrake.multibody.parsing import PackageMap
 
 from drake_pose.body.plant_source import told_multiplier
-from drake_pose.errors import ModelError, require_known
+from drake_pose.errors import ModelError, require_known, weighted
 
 OLD_XACRO_ELEMENTS = ("macro", "include")
 """Elements directly in <robot> of old xacro files, which have no ``xacro:`` prefix."""
@@ -177,7 +177,8 @@ def leave_out(
             element.remove(child)
             if child.tag not in known:
                 name = f" '{element.get('name')}'" if element.get("name") else ""
-                warn(f"{element.tag}{name}: the element <{child.tag}> is unknown and left out")
+                text = f"{element.tag}{name}: the element <{child.tag}> is unknown and left out"
+                warn(weighted(text, "note"))
 
 
 def open_loops(

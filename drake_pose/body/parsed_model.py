@@ -295,18 +295,24 @@ def _intersect_limits(
 def mimic_warnings(
     names: Sequence[str], followers: Sequence[Coupling], q: Array, spans: Array, slack: float = 0.1
 ) -> list[str]:
-    """Return a warning for each position in q (nq,) that does not follow its leader (<mimic>).
+    """Return a warning for each position in q that does not follow its leader (<mimic>).
 
-    ``names``: the position names. ``spans``: (nq,) upper minus lower limits [rad or m]. ``slack``:
-    tolerance, the smaller of this [rad or m] and this fraction of the span.
+    ``names``: the position names. ``q``: (nq,) or (n, nq) positions [rad or m]; nan: unknown.
+    ``spans``: (nq,) upper minus lower limits [rad or m]. ``slack``: tolerance, the smaller of this
+    [rad or m] and this fraction of the span.
     """
-    return [
-        f"joint '{names[follower]}' is written to follow joint '{names[leader]}' (<mimic>: "
-        f"{multiplier:g} x {offset:+g}), but the positions given do not: the body is posed by the "
-        "<mimic>; correct the positions, or remove the <mimic>"
-        for follower, leader, multiplier, offset in followers
-        if abs(q[follower] - multiplier * q[leader] - offset) > slack * min(1.0, spans[follower])
-    ]
+    warnings = list[str]()
+    for follower, leader, multiplier, offset in followers:
+        off = np.abs(q[..., follower] - multiplier * q[..., leader] - offset)
+        worst = float(np.fmax.reduce(off, axis=None, initial=0.0))
+        if worst > slack * min(1.0, spans[follower]):
+            warnings.append(
+                f"joint '{names[follower]}' is written to follow joint '{names[leader]}' (<mimic>: "
+                f"{multiplier:g} x {offset:+g}), but the positions given differ from that by up to "
+                f"{worst:.3g} [rad or m]: the body is posed by the <mimic>; correct the positions, "
+                "or the <mimic>"
+            )
+    return warnings
 
 
 def _search_limits(

@@ -37,7 +37,7 @@ from drake_pose.body.link_files import (
 from drake_pose.body.meshes import TriangleMesh, draws_given_files, read_meshes, workspace
 from drake_pose.body.model_files import FileFinder
 from drake_pose.body.plant_source import add_coupler
-from drake_pose.errors import DrakePoseError, ModelError
+from drake_pose.errors import DrakePoseError, ModelError, weight_of, weighted
 
 
 class ModelSource:
@@ -192,7 +192,8 @@ def summarise_warnings(warnings: Sequence[str], max_count: int = 10) -> list[str
     for alike in by_kind.values():
         shown += alike[:max_count]
         if len(alike) > max_count:
-            shown[-1] += f" ... and {len(alike) - max_count} more of this kind"
+            more = f" ... and {len(alike) - max_count} more of this kind"
+            shown[-1] = weighted(shown[-1] + more, weight_of(shown[-1]))
     return shown
 
 

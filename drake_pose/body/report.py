@@ -14,7 +14,7 @@ from drake_pose.body.meshes import TriangleMesh, is_watertight
 from drake_pose.body.model import ArticulatedModel, load_model
 from drake_pose.body.parsing import summarise_warnings
 from drake_pose.body.pose_tree import PoseTree
-from drake_pose.errors import DrakePoseError, listed
+from drake_pose.errors import DrakePoseError, listed, weighted
 
 
 @dataclass(frozen=True)
@@ -50,16 +50,17 @@ def describe_model(
         tree = model.pose_tree()
     except DrakePoseError as error:
         return ModelReport(path, "", (), (), (str(error),))
-    nodes = []
+    nodes, moved = [], {one.follower for one in tree.followers}
+    enforced = moved | {one.leader for one in tree.followers}
+    follows = {
+        follower: f"{multiplier:g} {model.position_names[leader]} {offset:+g}"
+        for follower, leader, multiplier, offset in model.couplings
+        if follower in enforced
+    }
     for node, placement in zip(tree.nodes, tree.placements, strict=True):
-        followers = {coupling.follower for coupling in placement.follows}
-        follows = {
-            follower: f"{multiplier:g} {model.position_names[leader]} {offset:+g}"
-            for follower, leader, multiplier, offset in tree.followers
-            if follower in followers
-        }
+        following = moved & {one.follower for one in placement.follows}
         joints = []
-        for position in (*node.positions, *follows):
+        for position in (*node.positions, *sorted(following)):
             scale = 180.0 / math.pi if model.position_kinds[position] == "angle" else 1.0
             joint = {
                 "name": model.position_names[position],
@@ -104,7 +105,17 @@ def model_warnings(model: ArticulatedModel, tree: PoseTree) -> tuple[str, ...]:
             "these joints move no visual geometry and keep their default values; add geometry to "
             "their links to estimate them: " + ", ".join(tree.unobserved_positions)
         )
-    warnings += _size_warnings(model, tree)
+    poses = tree.node_poses(tree.default_values())
+    pairs = zip(tree.nodes, poses, strict=True)
+    placed = [(node.mesh.vertices, X) for node, X in pairs if not node.mesh.is_empty]
+    corners = [vertices @ X[:3, :3].T + X[:3, 3] for vertices, X in placed]
+    size = float(np.ptp(np.concatenate(corners), axis=0).max()) if corners else 1.0
+    largest = 50.0  # Plausible extent [m]; the smallest is 1 / largest.
+    if not 1.0 / largest <= size <= largest:
+        warnings.append(
+            f"the body is {size:.3g} m long from end to end; check that its lengths and the scale "
+            "of its meshes are in metres"
+        )
     warnings += tree.warnings
     leaky = [
         f"'{node.name}'"
@@ -112,30 +123,9 @@ def model_warnings(model: ArticulatedModel, tree: PoseTree) -> tuple[str, ...]:
         if not node.mesh.is_empty and not is_watertight(node.mesh)
     ]
     if leaky:
-        warnings.append(
-            f"the meshes of {listed(leaky)} are not watertight: silhouettes may have gaps; close "
-            "the meshes"
-        )
+        text = f"the meshes of {listed(leaky)} are not watertight: silhouettes may have gaps"
+        warnings.append(weighted(f"{text}; close the meshes", "note"))
     return tuple(summarise_warnings(warnings + _symmetry_warnings(model)))
-
-
-def _size_warnings(model: ArticulatedModel, tree: PoseTree, largest: float = 50.0) -> list[str]:
-    """Return warnings about an implausible size.
-
-    ``largest``: plausible extent of the body in its default pose [m]; the smallest is 1 / largest.
-    """
-    poses = tree.node_poses(tree.default_values())
-    pairs = zip(tree.nodes, poses, strict=True)
-    placed = [(node.mesh.vertices, X) for node, X in pairs if not node.mesh.is_empty]
-    corners = [vertices @ X[:3, :3].T + X[:3, 3] for vertices, X in placed]
-    size = float(np.ptp(np.concatenate(corners), axis=0).max()) if corners else 1.0
-    warnings = []
-    if not 1.0 / largest <= size <= largest:
-        warnings.append(
-            f"the body is {size:.3g} m long from end to end; check that its lengths and the scale "
-            "of its meshes are in metres"
-        )
-    return warnings
 
 
 def _symmetry_warnings(model: ArticulatedModel) -> list[str]:

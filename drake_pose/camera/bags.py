@@ -1,22 +1,30 @@
 """Read episodes from bags of ROS 1 and ROS 2 (sqlite3 and mcap), by the library rosbags."""
 
+import re
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import replace
-from pathlib import Path
+from itertools import islice
+from pathlib import Path, PurePath
 from typing import Any
 
 import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from drake_pose.arrays import Array, Indices, Picture
+from drake_pose.arrays import Array, Picture
 from drake_pose.camera.calibration_files import lens_of
-from drake_pose.camera.episode import Episode, EpisodeCamera, JointLog, ascending_indices
-from drake_pose.camera.picture_files import decode_colours, import_reader, upper_bits
-from drake_pose.errors import CameraError, DrakePoseError, SceneError
-from drake_pose.input_files import pointer_hint
+from drake_pose.camera.episode import Episode, JointLog, Stream, ascending_indices
+from drake_pose.camera.picture_files import (
+    decode_colours,
+    import_reader,
+    naming_damage,
+    path_inside,
+    upper_bits,
+)
+from drake_pose.camera.pose_files import above
+from drake_pose.errors import CameraError, SceneError
+from drake_pose.input_files import read_regular
 
 BAGS = (".bag", ".mcap", ".db3")
 """Suffixes of bags."""
@@ -39,6 +47,8 @@ _ENCODINGS: dict[str, tuple[int, int | None]] = {
     "nv21": (1, cv2.COLOR_YUV2RGB_NV21),
 }
 
+_DAMAGED = "not a whole bag of ROS 1 or 2; ros2 bag reindex (or rosbag reindex) repairs one"
+
 # Other names of encodings. Types of OpenCV tell no order of colours: OpenCV's own is assumed.
 _ALIASES = {"8uc1": "mono8", "8uc3": "bgr8", "8uc4": "bgra8", "16uc3": "bgr16", "16uc4": "bgra16"}
 _ALIASES |= {"uyvy": "yuv422", "yuyv": "yuv422_yuy2", "yuy2": "yuv422_yuy2"}
@@ -57,8 +67,14 @@ def open_bag(path: Path, joints: JointLog | None) -> Episode:
     A camera whose frame is attached to others by `/tf_static` is mounted on the last of these.
 
     ``joints``: joint log to use instead of the bag's; None: the bag's, if it has any. Raises
-    SceneError: the bag is unreadable, truncated, or has no images.
+    SceneError: the bag is unreadable, truncated, has no images, or names files outside its folder.
     """
+    if (metadata := path / "metadata.yaml").is_file():
+        text = read_regular(metadata).decode("utf-8", "replace")
+        listed = re.search(r"relative_file_paths:((?:\s*- .*)+)", text)
+        for name in re.findall(r"- +['\"]?(.+?)['\"]?\s*$", listed[1] if listed else "", re.M):
+            if not (path / PurePath(name).name).is_file():
+                path_inside(path, name, f"{metadata}: relative_file_paths")
     pictures, states, infos, parents, ignored, kinds = _scan(path)
     warnings = [
         f"{f'pictures of {topic} are' if topic in pictures else f'{topic} is'} left out: {why}"
@@ -66,27 +82,22 @@ def open_bag(path: Path, joints: JointLog | None) -> Episode:
         if why != "depths"
     ]
     # Positions without names are named only if they are the only ones.
-    bare = [key for key in states if isinstance(key[1], int)]
-    if len(bare) == len(states) == 1:
-        topic, count = bare[0]
-        states[topic, tuple(f"joint_{k}" for k in range(count))] = states.pop(bare[0])
-        warnings.append(
-            f"{topic}: its JointState has no names: its {count} positions are taken for joints in "
-            "the model's order, if it has as many; record the names, or give a joint map"
-        )
-    elif bare:
-        states = {key: rows for key, rows in states.items() if key not in bare}
-        warnings += [
-            f"{topic} is left out: its JointState has {count} positions without names; record the "
-            "names"
-            for topic, count in bare
-        ]
+    is_alone = len(states) == 1
+    for topic, count in [key for key in states if isinstance(key[1], int)]:
+        rows, text = states.pop((topic, count)), "left out; record the names"
+        if is_alone:
+            states[topic, tuple(f"joint_{k}" for k in range(count))] = rows
+            text = (
+                "taken for joints in the model's order, if it has as many; record the names, or "
+                "give a joint map"
+            )
+        warnings.append(f"{topic}: its JointState has no names: its {count} positions are {text}")
     shifts, texts = _clock_shifts(pictures, states)
     warnings += texts
     if joints is None and states:
         joints, merge_warnings = _merge_joints(states, shifts)
         warnings += merge_warnings
-    cameras: dict[str, EpisodeCamera] = {}
+    cameras: dict[str, Stream] = {}
     # If a camera was recorded twice, prefer the uncompressed topic.
     for topic in sorted(pictures, key=lambda topic: (topic.endswith("/compressed"), topic)):
         parts = topic.strip("/").split("/")
@@ -100,11 +111,8 @@ def open_bag(path: Path, joints: JointLog | None) -> Episode:
             warnings.append(f"camera '{name}' is left out: {error}")
             continue
         # Follow static frames to the link that carries the camera, and its pose there.
-        frame, link, X_LC, visited = pictures[topic][0][2], None, np.eye(4), set[str]()
-        while frame in parents and frame not in visited:
-            visited.add(frame)
-            link, X_LF = parents[frame]
-            X_LC, frame = X_LF @ X_LC, link
+        frame = pictures[topic][0][2]
+        link, X_LC = above(parents, frame) if frame in parents else (None, np.eye(4))
         mounted = camera.camera and camera.camera.with_pose(X_LC)
         cameras[name] = replace(camera, name=name, camera=mounted, link=link)
     lacking = (
@@ -134,7 +142,7 @@ def _scan(path: Path) -> tuple[Any, Any, Any, Any, Any, Any]:
     infos, parents, ignored = {}, {}, dict[str, str]()
     orders: dict[tuple[str, frozenset[str]], tuple[str, ...]] = {}
     sensors = "Image", "CompressedImage", "JointState", "CameraInfo"
-    with _translate_errors(path), _make_reader(path) as reader:
+    with naming_damage(path, _DAMAGED), _make_reader(path) as reader:
         wanted = [
             one
             for one in reader.connections
@@ -262,38 +270,15 @@ def _make_reader(path: Path) -> Any:
     return import_reader("rosbags.highlevel", path).AnyReader([path], default_typestore=typestore)
 
 
-@contextmanager
-def _translate_errors(path: Path) -> Iterator[None]:
-    """Convert any error that rosbags raises on a truncated or damaged bag to a SceneError."""
-    try:
-        yield
-    except DrakePoseError:
-        raise
-    except Exception as error:  # The decompressors' errors have no common base class.
-        raise SceneError(
-            f"{path}: not a whole bag of ROS 1 or 2 ({type(error).__name__}: {error}); a truncated "
-            f"bag can be repaired by 'rosbag reindex' or 'ros2 bag reindex'{pointer_hint(path)}"
-        ) from error
+def _times(rows: Sequence[_Row], shift: int | None) -> Array:
+    """Return the times (n,) [s] of n messages; nan where the header has no stamp.
 
-
-def _ordered_times(
-    rows: Sequence[_Row], shift: int | None, what: str, warnings: list[str]
-) -> tuple[Array, Indices]:
-    """Return ascending times (k,) [s], and indices (k,) of their rows; other rows are left out.
-
-    ``rows``: the n messages. ``shift``: added to the stamps in the headers [ns]; None: use the
-    times in the bag. ``what``: name of the rows, for messages. ``warnings``: list to which warnings
-    are appended.
-
-    Raises SceneError: too many rows are out of order, see ``ascending_indices``.
+    ``shift``: added to the stamps in the headers [ns]; None: use the times in the bag.
     """
     stamps = np.array([row[:2] for row in rows])
-    times = 1e-9 * stamps[:, 1]
-    if shift is not None:
-        times = np.where(stamps[:, 0] > 0, 1e-9 * (stamps[:, 0] + shift), np.nan)
-    kept, late = ascending_indices(times, what)
-    warnings += late
-    return times[kept], kept
+    if shift is None:
+        return np.asarray(1e-9 * stamps[:, 1])
+    return np.where(stamps[:, 0] > 0, 1e-9 * (stamps[:, 0] + shift), np.nan)
 
 
 def _merge_joints(
@@ -309,9 +294,10 @@ def _merge_joints(
     columns: dict[str, Array] = {}
     owners: dict[str, str] = {}
     for (topic, names), rows in sorted(groups.items(), key=lambda one: -len(one[1])):
-        shift = shifts[topic, names]
-        times, kept = _ordered_times(rows, shift, f"{topic}: rows of {names[0]}", warnings)
-        log = JointLog(names, times, np.array([row[2] for row in rows])[kept])
+        times = _times(rows, shifts[topic, names])
+        kept, late = ascending_indices(times, f"{topic}: rows of {names[0]}")
+        warnings += late
+        log = JointLog(names, times, np.array([row[2] for row in rows])).only(kept)
         base = base or log
         assert base.times is not None
         if again := [name for name in names if owners.setdefault(name, topic) != topic]:
@@ -333,19 +319,20 @@ def _read_camera(
     shift: int | None,
     infos: Mapping[str, Any],
     warnings: list[str],
-) -> EpisodeCamera:
+) -> Stream:
     """Return the camera of a topic; its name is the topic, and its pose the identity.
 
     It has no ``camera`` if the bag has no calibration for images of its size.
 
-    ``path``: the bag. ``topic``: topic of the images. ``rows``: rows of the images. ``shift``: of
-    their stamps, see `_clock_shifts`. ``infos``: CameraInfo messages by topic. ``warnings``: list
-    to which warnings are appended.
+    ``shift``: see `_clock_shifts`. ``infos``: CameraInfo messages by topic. ``warnings``: appended
+    to.
 
     Raises SceneError: the first image is damaged, times run backwards, or the lens is unknown.
     """
-    times, kept = _ordered_times(rows, shift, f"{topic}: pictures", warnings)
-    source = _TopicPictures(path, topic, [row[1] for row in rows], kept)
+    times = _times(rows, shift)
+    # The camera is left out if its clock is useless.
+    ascending_indices(times, f"{topic}: pictures")
+    source = _TopicPictures(path, topic, [row[1] for row in rows])
     height, width = source.read(0).shape[:2]
     if source.encoding.startswith(("8uc3", "8uc4", "16uc")):
         warnings.append(
@@ -375,7 +362,7 @@ def _read_camera(
             raise SceneError(f"{error}; record rectified pictures") from error
         camera = lens.camera(topic, np.eye(4))
         lens = lens if lens.distortion.any() else None
-    return EpisodeCamera(topic, width, height, times, camera, None, source.read, (), lens)
+    return Stream(topic, width, height, times, camera, None, source.read, (), lens)
 
 
 def _field(info: Any, name: str) -> Array:
@@ -389,45 +376,39 @@ class _TopicPictures:
     Args:
         path: the bag.
         topic: topic of the images.
-        log_times: times in the bag [ns] of all messages of the topic, in the bag's order.
-        kept: (n,) indices of the messages of the images.
+        log_times: (n,) times in the bag [ns] of the topic's messages, in the bag's order.
 
     Attributes:
         encoding: encoding of the image that was read last, in lower case.
     """
 
-    def __init__(self, path: Path, topic: str, log_times: Sequence[int], kept: Indices) -> None:
-        self._path, self._topic = path, topic
-        # Messages may have the same time in the bag.
-        counts = defaultdict[int, int](int)
-        found = []
-        for time in log_times:
-            found.append((time, counts[time]))
-            counts[time] += 1
-        self._places = [found[k] for k in kept]
+    def __init__(self, path: Path, topic: str, log_times: Sequence[int]) -> None:
+        self._path, self._topic, self._times = path, topic, list(log_times)
         self._reader: Any = None
         self._messages: Iterator[Any] = iter(())
-        self._last = (-1, 0)
+        self._next = -1  # Number of the image that the next message has.
         self.encoding = ""
 
     def read(self, k: int) -> Picture:
-        """Return image k, from 0 in the order of ``kept``, (H, W, 3) red, green, blue.
+        """Return image k, from 0 in the bag's order, (H, W, 3) red, green, blue.
 
         Raises SceneError: it is damaged, or the bag's index is wrong.
         """
-        wanted, where = self._places[k], f"{self._path}: {self._topic}, picture {k}"
-        with _translate_errors(self._path):
+        wanted, where = self._times[k], f"{self._path}: {self._topic}, picture {k}"
+        with naming_damage(self._path, _DAMAGED):
             if self._reader is None:
                 self._reader = _make_reader(self._path)
                 self._reader.open()
-            if not k or self._last != self._places[k - 1]:
+            skipped = 0
+            if k != self._next:
                 own = [one for one in self._reader.connections if one.topic == self._topic]
-                self._messages = self._reader.messages(own, start=wanted[0])
-                self._last = (-1, 0)
-            for one, time, data in self._messages:
-                same = self._last[1] + 1 if time == self._last[0] else 0
-                self._last = (time, same)
-                if self._last == wanted:
+                self._messages = self._reader.messages(own, start=wanted)
+                # Messages may have the same time in the bag.
+                skipped = k - self._times.index(wanted)
+            self._next = -1
+            for one, time, data in islice(self._messages, skipped, skipped + 1):
+                if time == wanted:
+                    self._next = k + 1
                     message = self._reader.deserialize(data, one.msgtype)
                     is_file = one.msgtype.endswith("CompressedImage")
                     self.encoding = (message.format if is_file else message.encoding).lower()
@@ -442,7 +423,7 @@ def _decode_file(message: Any, where: str) -> Picture:
     """
     coding, _, rest = message.format.lower().partition(";")
     try:
-        picture = decode_colours(bytes(message.data), Path(where), SceneError)
+        picture = decode_colours(bytes(message.data), Path(where))
     except SceneError as error:
         raise SceneError(f"{error} (its format is '{message.format}')") from None
     # A mosaic is usually converted to bgr8 first, which the format then ends with.
@@ -471,7 +452,7 @@ def _decode(message: Any, where: str) -> Picture:
     used = rows.reshape(lines, step)[:, : width * size]
     if is_deep:
         order = ">u2" if message.is_bigendian else "<u2"
-        used = upper_bits(np.ascontiguousarray(used).view(order), where, SceneError)
+        used = upper_bits(np.ascontiguousarray(used).view(order), where)
         size //= 2
     used = used.reshape(lines, width, size)
     return np.ascontiguousarray(used if how is None else cv2.cvtColor(used, how))

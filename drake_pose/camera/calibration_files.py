@@ -1,225 +1,33 @@
-"""Read the files of calibration tools: ROS, Kalibr, OpenCV, and the TOML of anipose and Pose2Sim.
+"""Read cameras of calibration tools: ROS, Kalibr, OpenCV, anipose, DROID, easy_handeye, your own.
 
-The format is recognised by the content, not by the file's name. In all of them pixel centres are at
-integers, and poses map points of the world to the camera, p_C = R p_W + T [m].
+In all of them pixel centres are at integers. Each parser is a ``Parser``.
 """
 
-import json
 import re
-import tomllib
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-import cv2
 import numpy as np
 
 from drake_pose.arrays import Array
-from drake_pose.camera.models import Lens, check_number, check_pose, check_side, inverse_pose
-from drake_pose.camera.pose_files import episode_entry, finite_numbers, read_launch, recorded_poses
-from drake_pose.errors import CameraError
-from drake_pose.input_files import read_regular, read_yaml
-
-FORMATS = (
-    "this program's cameras.yaml, Drake's CameraConfig or Scenario, ROS camera_info, Kalibr's "
-    "camchain, OpenCV's FileStorage (camera_matrix, distortion_coefficients, image_width, "
-    "image_height, R, T), and the TOML of anipose, Pose2Sim or Caliscope; and, beside a file with "
-    "intrinsics, the poses of easy_handeye (.yaml, .calib), MoveIt's and other launch files of "
-    "static transforms, TransformStamped, DROID's cam2base_extrinsics.json, DROID-3D's "
-    "extrinsics.jsonl, and NAME: POSE, where POSE is a 4 x 4 matrix, [x, y, z, roll, pitch, yaw], "
-    "[x, y, z, qx, qy, qz, qw], or translation and rotation"
+from drake_pose.camera.models import Lens, check_pose, check_side, inverse_pose, numbers
+from drake_pose.camera.pose_files import (
+    END_EFFECTOR,
+    Content,
+    Entry,
+    Parsed,
+    optical,
+    plain_key,
+    pose_of,
+    standing,
 )
-"""Supported formats of camera files, for messages."""
+from drake_pose.errors import CameraError
+from drake_pose.errors import listed as listed_names
 
 
-def read_camera_content(
-    path: Path,
-    largest: int = 1 << 20,
-    largest_json: int = 1 << 29,
-    episode_ids: Collection[str] = (),
-) -> Any:
-    """Return the content of a YAML, JSON, TOML, FileStorage or launch file as plain values.
-
-    Matrices of a FileStorage are arrays. A launch file is a list of its static transforms.
-
-    ``largest``: maximum size of the file [byte]. ``largest_json``: the same for `.json` and
-    `.jsonl` [byte]. ``episode_ids``: of a `.jsonl`, only the lines that hold one of these names are
-    read, if any do. Raises CameraError: the file cannot be read.
-    """
-    is_json = path.suffix in (".json", ".jsonl")
-    try:
-        data = read_regular(path, (largest_json if is_json else largest) + 1)
-    except OSError as error:
-        raise CameraError(f"{path}: cannot read it: {error.strerror}") from error
-    text = data.decode("utf-8", errors="replace")
-    if path.suffix == ".jsonl" or (is_json and len(data) > largest):
-        try:
-            if path.suffix == ".json":
-                return json.loads(text)
-            records = [line for line in text.splitlines() if line.strip()]
-            own = [line for line in records if any(f'"{one}"' in line for one in episode_ids)]
-            return [json.loads(line) for line in own or records]
-        except ValueError as error:
-            raise CameraError(f"{path}: not a JSON file: {error}") from error
-    if len(data) <= largest and (launched := read_launch(text)) is not None:
-        return launched
-    if len(data) <= largest and text.startswith(("<?xml", "<opencv_storage", "%YAML:1.0")):
-        try:
-            storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
-            return _plain(storage.root())
-        # OpenCV raises SystemError if the file is truncated.
-        except (cv2.error, SystemError) as error:
-            raise CameraError(f"{path}: not a file of OpenCV's FileStorage: {error}") from error
-    lines = (line.strip() for line in text.splitlines())
-    first = next((line for line in lines if line and not line.startswith("#")), "")
-    if len(data) <= largest and re.fullmatch(r"\[[^\[\],{}]+\]|[\w.-]+\s*=.*", first):
-        try:
-            return tomllib.loads(text)
-        except tomllib.TOMLDecodeError as error:
-            raise CameraError(f"{path}: not a TOML file: {error}") from error
-    return read_yaml(path, CameraError)
-
-
-def calibrated_cameras(
-    content: Any, path: Path, episode_ids: Collection[str] = ()
-) -> dict[str, tuple[Lens, Array | None]]:
-    """Return the cameras in a calibration tool's file, by name; empty if it is not such a file.
-
-    In Kalibr's camchain the first camera is the world. A single camera without a name gets the
-    file's.
-
-    ``content``: content of the file, as from ``read_camera_content``. ``path``: the file, for
-    messages and a camera without a name. ``episode_ids``: names by which the recording may be known
-    in DROID's files of many episodes.
-
-    Returns the lens and the pose X_WC (4, 4) [m] of each camera by name; None: the file has no
-    pose.
-
-    Raises CameraError: a field is missing or invalid, OpenCV does not have the lens model, or a
-    camera is so far away that lengths cannot be in metres.
-    """
-    if isinstance(content, list):
-        return _droid_3d(content, path)
-    if "camera_matrix" in content:
-        name = str(content.get("camera_name", path.stem))
-        where = f"{path}: camera '{name}'"
-        size = [content.get(f"image_{side}") for side in ("width", "height")]
-        if None in size:
-            raise CameraError(f"{where}: needs image_width and image_height [pixel]: add them")
-        numbers = content["camera_matrix"], content.get("distortion_coefficients", ())
-        lens = lens_of(size, *numbers, str(content.get("distortion_model", "plumb_bob")), where)
-        # The R of a camera_info rectifies images and is not a pose; it has no T.
-        return {name: (lens, _pose(content, "R", "T", where) if "T" in content else None)}
-    entries = {str(key): one for key, one in content.items() if isinstance(one, dict)}
-    chain = {k: one for k, one in entries.items() if {"camera_model", "intrinsics"} <= {*one}}
-    if chain:
-        return dict(_kalibr(chain, path))
-    tables = {k: one for k, one in entries.items() if {"matrix", "distortions"} & {*one}}
-    found = dict[str, tuple[Lens, Array | None]]()
-    for key, table in tables.items():
-        name, where = str(table.get("name", key)), f"{path}: camera '{key}'"
-        if name in found:
-            raise CameraError(f"{where}: the name '{name}' is given twice")
-        numbers = table.get("matrix"), table.get("distortions", ())
-        lens = _lens(table.get("size"), *numbers, bool(table.get("fisheye", False)), where)
-        found[name] = lens, _pose(table, "rotation", "translation", where)
-    if not found and (single := _camera_info(content, f"{path}: camera '{path.stem}'")):
-        return {str(content.get("camera_name", path.stem)): (single, None)}
-    for key, entry in () if found else entries.items():
-        if (own := _camera_info(entry, f"{path}: camera '{key}'")) is not None:
-            poses = recorded_poses({key: entry}, path)
-            found[key] = own, poses[key].X if key in poses else None
-    return found or _droid_intrinsics(entries, path, episode_ids)
-
-
-def _camera_info(entry: Mapping[Any, Any], where: str) -> Lens | None:
-    """Return the lens of a ROS CameraInfo message, or of width, height and fx, fy, cx, cy.
-
-    A CameraInfo has K or k; librealsense says ppx and ppy for cx and cy. None: it is neither.
-    """
-    one = {str(key).lower(): value for key, value in entry.items()}
-    if isinstance(one.get("intrinsics"), dict):
-        one |= {str(key).lower(): value for key, value in one["intrinsics"].items()}
-    numbers = [one.get(key, one.get(other)) for key, other in
-               (("fx", "fx"), ("fy", "fy"), ("cx", "ppx"), ("cy", "ppy"))]  # fmt: skip
-    matrix = next((one[key] for key in ("k", "intrinsic_matrix", "intrinsics") if key in one), None)
-    if None not in numbers:
-        matrix = [numbers[0], 0.0, numbers[2], 0.0, numbers[1], numbers[3], 0.0, 0.0, 1.0]
-    found = _numbers(matrix)
-    if found is None or found.size != 9 or not {"width", "height"} <= {*one}:
-        return None
-    distortion = next((one[key] for key in ("d", "coeffs", "distortion") if key in one), ())
-    model = str(one.get("distortion_model", "plumb_bob")) or "plumb_bob"
-    return lens_of([one["width"], one["height"]], matrix, distortion or (), model, where)
-
-
-def _droid_intrinsics(
-    entries: Mapping[str, Mapping[Any, Any]],
-    path: Path,
-    episode_ids: Collection[str],
-    size: tuple[int, int] = (1280, 720),
-) -> dict[str, tuple[Lens, Array | None]]:
-    """Return the lenses of DROID's intrinsics.json, by serial number; empty if it is none.
-
-    Its entries are [fx, cx, fy, cy] by serial number, by episode.
-
-    size: width and height of the pictures to which they apply: HD720 [pixel].
-    """
-    rows = [_numbers(value) for one in entries.values() for value in one.values()]
-    if not rows or any(one is None or one.shape != (4,) or one.min() < 1.0 for one in rows):
-        return {}
-    found = dict[str, tuple[Lens, Array | None]]()
-    for serial, (fx, cx, fy, cy) in (episode_entry(entries, path, episode_ids) or {}).items():
-        matrix = [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
-        found[str(serial)] = _lens(size, matrix, (), False, f"{path}: camera '{serial}'"), None
-    return found
-
-
-def _droid_3d(records: Sequence[Any], path: Path) -> dict[str, tuple[Lens, Array | None]]:
-    """Return the lenses of DROID-3D's camera_intrinsics.jsonl, by serial number, of one episode.
-
-    Empty if it is not such a file. Raises CameraError: it holds several episodes.
-    """
-    held = [
-        one for one in records if isinstance(one, dict) and isinstance(one.get("cameras"), dict)
-    ]
-    if not held:
-        return {}
-    if len(held) > 1:
-        raise CameraError(
-            f"{path}: has {len(held)} episodes, and this recording does not say which is its own: "
-            "keep only its line"
-        )
-    found = dict[str, tuple[Lens, Array | None]]()
-    for role, one in held[0]["cameras"].items():
-        where = f"{path}: camera '{role}'"
-        left = one.get("left") if isinstance(one, dict) else None
-        # The recorded pictures are rectified: their distortion is removed.
-        lens = None if not isinstance(left, dict) else _camera_info(left | {"disto": ()}, where)
-        if lens is not None:
-            found[str(one.get("serial") or role)] = lens, None
-    return found
-
-
-def _plain(node: Any) -> Any:
-    """Return a node of OpenCV's FileStorage as mappings, lists, arrays, texts and numbers."""
-    if node.isMap():
-        if {"rows", "cols", "data"} <= {*node.keys()}:
-            return np.asarray(node.mat(), dtype=np.float64)
-        return {name: _plain(node.getNode(name)) for name in node.keys()}  # noqa: SIM118
-    if node.isSeq():
-        return [_plain(node.at(k)) for k in range(node.size())]
-    return node.string() if node.isString() else node.real()
-
-
-def _numbers(value: Any) -> Array | None:
-    """Return the finite numbers (n,), by rows, of an array, list or mapping ``data``; or None."""
-    if isinstance(value, dict):
-        value = value.get("data")
-    return finite_numbers(value)
-
-
-def lens_of(size: Any, matrix: Any, distortion: Any, model: str, where: str) -> Lens:
+def lens_of(
+    size: Any, matrix: Any, distortion: Any, model: str, where: str, largest_skew: float = 1e-3
+) -> Lens:
     """Return a lens by the name that ROS and Kalibr give to its distortion model.
 
     The first three arguments are checked; each may be a list, an array, or a mapping whose ``data``
@@ -231,8 +39,10 @@ def lens_of(size: Any, matrix: Any, distortion: Any, model: str, where: str) -> 
         distortion: OpenCV's distortion coefficients; empty: none.
         model: name of the distortion model.
         where: start of error messages.
+        largest_skew: maximum skew that is ignored [f_x]; it amounts to half a pixel at the edge of
+            an image.
 
-    Raises CameraError: the model is unknown, or a value is invalid.
+    Raises CameraError: the model is unknown, or a value is missing or invalid.
     """
     kinds = {"plumb_bob": False, "rational_polynomial": False, "radtan": False, "none": False}
     kinds |= {"equidistant": True, "fisheye": True}  # OpenCV's fisheye.
@@ -240,56 +50,12 @@ def lens_of(size: Any, matrix: Any, distortion: Any, model: str, where: str) -> 
         raise CameraError(
             f"{where}: distortion_model '{model}' is unknown; known are {', '.join(kinds)}"
         )
-    return _lens(size, matrix, distortion, kinds[model], where)
-
-
-def _kalibr(
-    chain: Mapping[str, Mapping[str, Any]], path: Path
-) -> Iterator[tuple[str, tuple[Lens, Array | None]]]:
-    """Yield the name, lens and pose X_WC (4, 4) [m] of each camera of Kalibr's camchain.
-
-    The first camera is the world. Poses follow from T_cn_cnm1, the previous camera's pose in each
-    camera. The pose is None for all cameras if none has it, and else for a later camera that lacks
-    it and those after it.
-
-    ``chain``: entries of the file by camera, in order. ``path``: the file, for messages.
-    """
-    is_chain = any("T_cn_cnm1" in entry for entry in chain.values())
-    X_CW: Array | None = np.eye(4) if is_chain else None
-    for k, (name, entry) in enumerate(chain.items()):
-        where, numbers = f"{path}: camera '{name}'", _numbers(entry["intrinsics"])
-        if entry["camera_model"] != "pinhole":
-            raise CameraError(
-                f"{where}: Kalibr's '{entry['camera_model']}' camera is not supported: calibrate "
-                "it as a pinhole with radtan, equidistant or none"
-            )
-        if numbers is None or numbers.size != 4:
-            raise CameraError(f"{where}: intrinsics must be [f_x, f_y, c_x, c_y]")
-        fx, fy, cx, cy = numbers.tolist()
-        matrix = [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
-        model, coefficients = str(entry.get("distortion_model")), entry.get("distortion_coeffs", ())
-        lens = lens_of(entry.get("resolution"), matrix, coefficients, model, where)
-        if k and X_CW is not None:
-            step = entry.get("T_cn_cnm1")
-            X_CW = None if step is None else check_pose(step, "T_cn_cnm1", where) @ X_CW
-        yield name, (lens, None if X_CW is None else inverse_pose(X_CW))
-
-
-def _lens(
-    size: Any, matrix: Any, distortion: Any, fisheye: bool, where: str, largest_skew: float = 1e-3
-) -> Lens:
-    """Return a lens from a size [pixel], a camera matrix (3, 3) [pixel] and OpenCV's coefficients.
-
-    ``size``, ``matrix``, ``distortion``: values of the file, not yet checked. ``fisheye``: whether
-    the coefficients are those of OpenCV's fisheye. ``where``: start of error messages.
-    ``largest_skew``: maximum skew that is ignored [f_x]; it amounts to half a pixel at the edge of
-    an image.
-
-    Raises CameraError: a value is missing or invalid.
-    """
-    sides, K, D = (_numbers(one) for one in (size, matrix, distortion))
+    fisheye = kinds[model]
+    sides, K, D = (numbers(one) for one in (size, matrix, distortion))
     if sides is None or sides.size != 2:
-        raise CameraError(f"{where}: needs the pictures' width and height [pixel]")
+        raise CameraError(
+            f"{where}: needs the pictures' width and height [pixel]: add image_width, image_height"
+        )
     width, height = (
         check_side(side, name, where) for side, name in zip(sides, ("width", "height"), strict=True)
     )
@@ -302,43 +68,207 @@ def _lens(
             f"{where}: its camera matrix has a skew of {K[1]:g} pixels, which is not modelled: "
             "calibrate without skew, or set it to 0 if it is negligible"
         )
-    if D is None:
-        raise CameraError(f"{where}: its distortion coefficients must be a list of finite numbers")
-    D = D if D.size else np.zeros(4)
     counts = (4,) if fisheye else (4, 5, 8, 12, 14)
-    D = D[:4] if fisheye and not D[4:].any() else D
-    if D.size not in counts:
+    D = np.zeros(4) if D is not None and not D.any() else D
+    D = D[:4] if D is not None and fisheye and not D[4:].any() else D
+    if D is None or D.size not in counts:
         raise CameraError(
-            f"{where}: has {D.size} distortion coefficients; OpenCV's "
-            f"{'fisheye' if fisheye else 'lens'} has {' or '.join(map(str, counts))}"
+            f"{where}: has {0 if D is None else D.size} distortion coefficients that are numbers; "
+            f"OpenCV's {'fisheye' if fisheye else 'lens'} has {' or '.join(map(str, counts))}"
         )
     return Lens(width, height, np.array([[K[0], 0, K[2]], [0, K[4], K[5]], [0, 0, 1]]), D, fisheye)
 
 
-def _pose(
-    content: Mapping[Any, Any], rotation: str, translation: str, where: str, farthest: float = 100.0
-) -> Array | None:
-    """Return X_WC (4, 4) of p_C = R p_W + T; None if there is neither R nor T.
+def matrix_of(fx: Any, fy: Any, cx: Any, cy: Any) -> list[Any]:
+    """Return the elements (9) of a camera matrix, by rows [pixel]."""
+    return [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
 
-    ``content``: a camera's entry in the file. ``rotation``, ``translation``: keys of R, a matrix or
-    a rotation vector [rad], and T [m]. ``where``: start of error messages. ``farthest``: maximum
-    distance from the world's origin [m]; beyond it lengths are taken to be in millimetres.
+
+def _lens(
+    entry: Mapping[Any, Any], where: str, is_needed: bool, own: Sequence[int] | None = None
+) -> Lens | None:
+    """Return the lens of a mapping, by the keys of any tool; None: it has none.
+
+    A ROS CameraInfo has K or k, librealsense ppx and ppy for cx and cy, Kalibr [fx, fy, cx, cy].
+
+    is_needed: whether a camera matrix without the pictures' width and height is an error. own:
+    width and height [pixel] of the recording's pictures, if the mapping has none; None: unknown.
     """
-    if rotation not in content and translation not in content:
+    one = {plain_key(key): value for key, value in entry.items()}
+    for key in ("intrinsics", "intrinsic"):
+        if isinstance(one.get(key), dict):
+            one |= {plain_key(k): value for k, value in one.pop(key).items()}
+
+    def first(*keys: str) -> Any:
+        return next((one[key] for key in keys if one.get(key) is not None), None)
+
+    sides = [first("width", "imagewidth"), first("height", "imageheight")]
+    size = first("size", "resolution") if None in sides else sides
+    K = first("cameramatrix", "matrix", "k", "intrinsicmatrix", "intrinsics")
+    focal = [first("fx"), first("fy"), first("cx", "ppx"), first("cy", "ppy")]
+    four = numbers(K if None in focal else focal)
+    K = K if four is None or four.size != 4 else matrix_of(*four.tolist())
+    D = first(
+        "distortioncoefficients", "distortioncoeffs", "distortions", "d", "coeffs", "distortion"
+    )
+    # A pose with the distortion of the original pictures may be meant for straight ones.
+    if size is None and (is_needed or not np.any(numbers(D))):
+        size = own
+    if (given := numbers(K)) is None or given.size != 9 or (size is None and not is_needed):
         return None
-    R, T = _numbers(content.get(rotation)), _numbers(content.get(translation))
-    if R is None or T is None or R.size not in (3, 9) or T.size != 3:
+    model = "fisheye" if one.get("fisheye") else first("distortionmodel") or "plumb_bob"
+    return lens_of(size, K, () if D is None else D, str(model), where)
+
+
+def _entry(name: str, value: Any, content: Content, farthest: float = 100.0) -> Entry | None:
+    """Return a camera's lens, pose, or both, from plain values; None: they have neither.
+
+    content: of the file. farthest: maximum distance from the world's origin [m]; beyond it lengths
+    are taken to be in millimetres.
+    """
+    where, lens, four = f"{content.path}: camera '{name}'", None, numbers(value)
+    given = value if isinstance(value, dict) else {}
+    # OpenCV's R and T, and those of anipose, map the world to the camera.
+    tools = {"camera_matrix": ("R", "T"), "distortions": ("rotation", "translation")}
+    is_both = (keys for key, keys in tools.items() if {key, keys[1]} <= {*given})
+    R, T = next(is_both, ("", ""))
+    pose = pose_of({"rvec": given.get(R), "t": given.get(T)} if T else value, where)
+    # The R of a ROS file rectifies images and is not a pose; it has no T.
+    if T in given:
+        if pose is None or pose.X is None:
+            raise CameraError(
+                f"{where}: {R} must be a 3 x 3 matrix or a rotation vector [rad], and {T} three "
+                "numbers [m]"
+            )
+        away = float(np.linalg.norm(pose.X[:3, 3]))
+        if away > farthest:
+            raise CameraError(
+                f"{where}: stands {away:.0f} m from the world's origin; are its lengths "
+                f"millimetres? Give {T} in metres"
+            )
+        pose = Entry(inverse_pose(pose.X))
+    if given:
+        sizes = {*content.sizes.values()}
+        own = content.sizes.get(name, *sizes) if len(sizes) == 1 else content.sizes.get(name)
+        lens = _lens(given, where, pose is None or T != "", own)
+    # DROID's pictures, HD720 [pixel]: [fx, cx, fy, cy].
+    elif four is not None and four.size == 4 and four.min() >= 1.0:
+        lens = lens_of([1280, 720], matrix_of(*four[[0, 2, 1, 3]]), (), "none", where)
+    if lens is None:
+        return pose
+    return (pose or Entry())._replace(camera=lens.camera(name, np.eye(4)), lens=lens)
+
+
+def kalibr(content: Content) -> Parsed:
+    """Read Kalibr's camchain: its first camera is the world.
+
+    Poses follow from T_cn_cnm1, the previous camera's pose in each camera. The pose is unknown for
+    all cameras if none has it, and else for a later camera that lacks it and those after it.
+    """
+    entries = {str(key): one for key, one in content.mapping.items() if isinstance(one, dict)}
+    chain = {key: one for key, one in entries.items() if "camera_model" in one}
+    is_chain = any("T_cn_cnm1" in entry for entry in chain.values())
+    X_CW: Array | None = np.eye(4) if is_chain else None
+    found = dict[str, Entry]()
+    for name, entry in chain.items():
+        where = f"{content.path}: camera '{name}'"
+        if entry["camera_model"] != "pinhole":
+            raise CameraError(
+                f"{where}: Kalibr's '{entry['camera_model']}' camera is not supported: calibrate "
+                "it as a pinhole with radtan, equidistant or none"
+            )
+        lens = _lens(entry, where, is_needed=True)
+        if lens is None:
+            raise CameraError(f"{where}: intrinsics must be [f_x, f_y, c_x, c_y]")
+        if found and X_CW is not None:
+            step = entry.get("T_cn_cnm1")
+            X_CW = None if step is None else check_pose(step, "T_cn_cnm1", where) @ X_CW
+        X_WC = None if X_CW is None else inverse_pose(X_CW)
+        found[name] = Entry(X_WC, camera=lens.camera(name, np.eye(4)), lens=lens)
+    return found or "no camera_model"
+
+
+def by_name(content: Content) -> Parsed:
+    """Read lenses and poses below the cameras' names; other entries are left out.
+
+    Such are the tables of anipose, Pose2Sim and Caliscope, whose names may be in ``name``.
+    """
+    found = dict[str, Entry]()
+    for key, value in content.mapping.items():
+        name = str(value.get("name", key) if isinstance(value, dict) else key)
+        if (one := _entry(name, value, content)) is not None:
+            if name in found:
+                raise CameraError(f"{content.path}: camera '{name}' is given twice")
+            found[name] = one
+    return found or "no lens and no pose below a name"
+
+
+def single(content: Content) -> Parsed:
+    """Read one camera without a name, and hand-eye calibrations of easy_handeye."""
+    given = content.mapping
+    # The words of easy_handeye, ROS 1 and 2.
+    more = given.get("parameters")
+    words = given | (more if isinstance(more, dict) else {})
+    name = str(words.get("tracking_base_frame") or words.get("camera_name") or content.path.stem)
+    one = _entry(name, given, content) if given else None
+    if one is None:
+        return "no T_base_cam, transformation, or translation and rotation"
+    if words.get("eye_on_hand") is True or words.get("calibration_type") == "eye_in_hand":
+        one = one._replace(link=str(words.get("robot_effector_frame") or END_EFFECTOR))
+    return {name: optical(name, one, is_turned=name.endswith("_link"))}
+
+
+def listed(content: Content) -> Parsed:
+    """Read an array or a list of poses: one, one of each frame, or each with its camera's name."""
+    value, path = content.value, content.path
+    if not isinstance(value, list | np.ndarray):
+        return "no list or array"
+    if (one := pose_of(value, str(path))) is not None:
+        return {path.stem: one}
+    named, found = dict[str, Entry](), list[Entry]()
+    for k, item in enumerate(value):
+        given = item if isinstance(item, dict) else {}
+        keys = [key for key in given if re.fullmatch("name|.*(cam|serial).*", str(key))]
+        names = [str(given[key]) for key in keys if isinstance(given[key], str | int)]
+        if (entry := _entry(names[0] if names else str(k), item, content)) is not None:
+            found.append(entry)
+            named |= dict.fromkeys(names[:1], entry)
+    return named if found and len(named) == len(found) else standing(found, path)
+
+
+def episodes(content: Content) -> Parsed:
+    """Read a file of many episodes, such as DROID's: poses or intrinsics by camera, by episode.
+
+    DROID-3D has a line for each episode, with ``cameras`` (intrinsics) or ``T0_ext1_in_world``,
+    which maps the world to the camera despite its name.
+    """
+    groups = content.mapping
+    if isinstance(content.value, list):
+        records = [one for one in content.value if isinstance(one, dict)]
+        groups = {str(one.get("episode_uuid", k)): _droid_3d(one) for k, one in enumerate(records)}
+
+    def read(key: str) -> dict[str, Entry]:
+        found = by_name(content._replace(value=groups[key]))
+        return {} if isinstance(found, str) else found
+
+    own = [key for key in groups if key in content.episode_ids]
+    held = own if len(own) == 1 else [key for key in groups if read(key)]
+    if len(held) > 1:
+        names = listed_names(sorted(content.episode_ids)) or "unknown (metadata_<episode ID>.json)"
         raise CameraError(
-            f"{where}: {rotation} must be a 3 x 3 matrix or a rotation vector [rad], and "
-            f"{translation} three numbers [m]"
+            f"{content.path}: has {len(held)} entries, from {held[0]} on; this recording's names "
+            f"are {names}: keep only the entry of the episode in the file"
         )
-    X_CW = np.eye(4)
-    X_CW[:3, :3] = R.reshape(3, 3) if R.size == 9 else cv2.Rodrigues(R)[0]
-    X_CW[:3, 3] = [check_number(one, translation, where) for one in T]
-    away = float(np.linalg.norm(T))
-    if away > farthest:
-        raise CameraError(
-            f"{where}: stands {away:.0f} m from the world's origin; are its lengths millimetres? "
-            f"Give {translation} in metres"
-        )
-    return inverse_pose(check_pose(X_CW, rotation, where))
+    return (read(held[0]) if held else {}) or "no poses by episode"
+
+
+def _droid_3d(record: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the cameras of a line of DROID-3D's files: poses or intrinsics by name."""
+    keys = {"ext1": "T0_ext1_in_world", "ext2": "T1_ext2_in_world"}
+    found = {name: {"world_to_camera": record[key]} for name, key in keys.items() if key in record}
+    cameras = record.get("cameras")
+    for role, one in cameras.items() if isinstance(cameras, dict) else ():
+        if isinstance(one, dict) and isinstance(one.get("left"), dict):
+            # Its `disto` is not read: the recorded pictures are rectified.
+            found[str(one.get("serial") or role)] = one["left"]
+    return found

@@ -1,14 +1,25 @@
-"""Read and write this program's camera files; read those of Drake and of calibration tools."""
+"""Read camera files: this program's, Drake's, and those of other tools; write this program's.
 
+``PARSERS`` has a function for each format. They are tried in order.
+"""
+
+import io
+import json
+import re
+import tomllib
+import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Collection, Iterable, Mapping
-from dataclasses import dataclass, field
+from contextlib import suppress
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import yaml
 
-from drake_pose.camera.calibration_files import FORMATS, calibrated_cameras, read_camera_content
+from drake_pose.camera import calibration_files, pose_files
+from drake_pose.camera.calibration_files import lens_of, matrix_of
 from drake_pose.camera.models import (
     HALF_PIXEL,
     Camera,
@@ -16,27 +27,12 @@ from drake_pose.camera.models import (
     ParallelCamera,
     PinholeCamera,
     camera_tuple,
-    check_number,
     check_pose,
 )
-from drake_pose.camera.pose_files import RecordedPose, recorded_poses, recording_names, same_camera
-from drake_pose.errors import CameraError, listed
-from drake_pose.input_files import named_fields
-
-_COMMON = ("width", "height", "center_x", "center_y")
-_REQUIRED = {
-    "pinhole": (*_COMMON, "focal_x", "focal_y"),
-    "parallel": (*_COMMON, "pixels_per_metre"),
-}
-_OPTIONAL = {
-    "pinhole": (
-        "X_WC", "link", "X_LC", "projection", "clipping_near", "pixel_centers", "distortion",
-    ),
-    "parallel": ("X_WC", "projection", "pixel_centers"),
-}  # fmt: skip
-_FIELDS = {
-    field for fields in (_REQUIRED, _OPTIONAL) for names in fields.values() for field in names
-}
+from drake_pose.camera.picture_files import SUFFIXES, picture_size
+from drake_pose.camera.pose_files import Content, Entry, Parsed, Parser, same_camera
+from drake_pose.errors import CameraError, SceneError, listed
+from drake_pose.input_files import named_fields, read_regular, read_yaml
 
 
 def load_cameras(
@@ -52,9 +48,8 @@ def load_cameras(
     pinhole` and `clipping_near` [m] are optional. A parallel camera has `projection: parallel` and
     `pixels_per_metre` instead of focal lengths.
 
-    Drake's files are recognised by their fields: a Scenario (``cameras:``, possibly below one
-    name), a mapping of CameraConfigs, or a single one; their principal points are converted. Files
-    of ROS, Kalibr, OpenCV, anipose, Pose2Sim and Caliscope are recognised likewise.
+    ``PARSERS`` lists the other formats, which are recognised by their content. Principal points of
+    Drake's files are converted.
 
     ``known``, ``recording``: as in ``load_camera_file``. ``warnings``: list to which warnings are
     appended; None: they are dropped.
@@ -142,70 +137,58 @@ def load_camera_file(
     """
     path = Path(path)
     episode_ids, serials = recording_names(recording)
-    content = read_camera_content(path, episode_ids=episode_ids)
-    if not isinstance(content, dict | list) or not content:
-        raise CameraError(f"{path}: expected a mapping from camera names to their parameters")
-    calibrated = calibrated_cameras(content, path, episode_ids)
-    poses = {} if calibrated else recorded_poses(content, path, episode_ids)
-    if poses:
-        named = {serials.get(name, name): one for name, one in poses.items()}
-        return _placed(path, named, None if known is None else known())
-    if isinstance(content, list):
-        if not calibrated:
-            raise CameraError(
-                f"{path}: expected a mapping from camera names to their parameters, but it has a "
-                "list that is no pose"
-            )
-        content = {}
-    configs = None if calibrated else _find_configs(content, path)
-    if configs is not None:
-        # Import Drake only if needed, because it loads slowly.
-        from drake_pose.camera.exchange import read_configs
-
-        read = read_configs(configs, path)
-        return CameraFile({_check_name(name, path): read[name] for name in read}, ())
-    entries = [entry for entry in content.values() if isinstance(entry, dict)]
-    if not (calibrated or any(_FIELDS & {*entry} for entry in entries)):
-        found = ", ".join(map(str, content))
-        raise CameraError(
-            f"{path}: is not a camera file: it has {found[:200]}; supported are {FORMATS}"
-        )
-    cameras, lenses = dict[str, Camera](), dict[str, Lens]()
-    links, unplaced = dict[str, str](), list[str]()
-    for key in calibrated or content:
-        name = _check_name(key, path)
-        if name in cameras:
-            raise CameraError(f"{path}: camera '{name}' is given twice")
-        lens: Lens | None
-        if calibrated:
-            lens, X_WC = calibrated[name]
-            cameras[name] = lens.camera(name, np.eye(4) if X_WC is None else X_WC)
-            is_placed = X_WC is not None
-        else:
-            entry = content[key]
-            camera = _read_camera(name, entry, path)
-            lens = _read_lens(camera, entry.get("distortion"), f"{path}: camera '{name}'")
-            cameras[name] = camera if lens is None else lens.camera(name, camera.X_WC)
-            links |= {name: entry["link"]} if "link" in entry else {}
-            is_placed = "X_WC" in entry or "link" in entry
-        unplaced += [] if is_placed else [name]
-        lenses |= {name: lens} if lens is not None and lens.distortion.any() else {}
+    content = _read(path, episode_ids)._replace(sizes=_picture_sizes(recording))
+    missed = dict[str, list[str]]()
+    for format_name, parser in PARSERS.items():
+        parsed = parser(content)
+        if not isinstance(parsed, str):
+            break
+        missed.setdefault(parsed, []).append(format_name)
+    else:
+        has = f": it has {', '.join(map(str, content.mapping))[:200]}" if content.mapping else ""
+        tried = "; ".join(f"{', '.join(names)} ({why})" for why, names in missed.items())
+        why = content.fault or f"is no camera file{has}"
+        raise CameraError(f"{path}: {why}. Tried: {tried}")
+    if [*parsed] == [path.stem] and parsed[path.stem].camera and len(content.sizes) == 1:
+        # The file does not name its camera, and the recording has one alone.
+        serials[path.stem] = next(iter(content.sizes)) or path.stem
+    entries = {serials.get(name, name): one for name, one in parsed.items()}
+    if all(one.camera is None for one in entries.values()):
+        entries = _placed(path, entries, None if known is None else known())
+    cameras: dict[str, Camera] = {
+        name: replace(one.camera, name=name) for name, one in entries.items() if one.camera
+    }
+    for name in cameras:
+        if name in ("", ".", "..") or set(name) & set("/\\\0"):
+            raise CameraError(f"{path}: {name[:40]!r} is not a valid camera name")
+    found = {name: entries[name] for name in cameras}
+    lenses = {k: v.lens for k, v in found.items() if v.lens is not None and v.lens.distortion.any()}
     if lenses and not distorted:
         raise CameraError(
             f"{path}: camera '{next(iter(lenses))}' has distortion, but undistorted pictures and "
             "masks are needed here: straighten the pictures with cv2.undistort, and give the "
             "camera matrix of the straight ones (tutorials/commands.md)"
         )
-    return CameraFile(cameras, tuple(unplaced), links, lenses)
+    left_out = [name for name in entries if name not in cameras]
+    texts = [f"camera '{name}' is left out, as it has no intrinsics" for name in left_out]
+    assumed = [one.assumed for one in found.values() if one.assumed]
+    texts += [f"{text}; audit tests other readings" for text in dict.fromkeys(assumed)]
+    return CameraFile(
+        {k: v if (X := found[k].X) is None else v.with_pose(X) for k, v in cameras.items()},
+        tuple(name for name, one in found.items() if one.X is None),
+        {name: one.link for name, one in found.items() if one.link},
+        lenses,
+        tuple(f"{path}: {text}" for text in texts),
+    )
 
 
-def _placed(path: Path, poses: Mapping[str, RecordedPose], known: CameraFile | None) -> CameraFile:
+def _placed(path: Path, entries: Mapping[str, Entry], known: CameraFile | None) -> dict[str, Entry]:
     """Return the known cameras at the poses of a file (``path``) that has no intrinsics.
 
-    ``poses``: by the file's names. ``known``: by the recording's names; None: there are none.
+    ``entries``: by the file's names. ``known``: by the recording's names; None: there are none.
     Raises CameraError: there are no intrinsics, or no pose is one of a known camera.
     """
-    names = listed(sorted(poses))
+    names = listed(sorted(entries))
     if known is None or not known.cameras:
         raise CameraError(
             f"{path}: has poses ({names}) but no intrinsics: give a file with the pictures' width "
@@ -213,21 +196,131 @@ def _placed(path: Path, poses: Mapping[str, RecordedPose], known: CameraFile | N
             "camera_info or this program's cameras.yaml)"
         )
     own = [*known.cameras]
-    meant = {name: same_camera(name, own) for name in poses}
-    if len(poses) == len(own) == 1:
-        meant = {next(iter(poses)): own[0]}
-    found = {camera: poses[name] for name, camera in meant.items() if camera is not None}
+    is_one = len(entries) == len(own) == 1
+    meant = {name: own[0] if is_one else same_camera(name, own) for name in entries}
+    found = {camera: entries[name] for name, camera in meant.items() if camera is not None}
     if not found:
         raise CameraError(
             f"{path}: has poses of {names}, but the recording's cameras are {listed(own)}: name "
             "them alike in the file, or name the one camera that it is for (--camera NAME)"
         )
-    cameras = {name: known.cameras[name].with_pose(one.X) for name, one in found.items()}
-    links = {name: one.link for name, one in found.items() if one.link}
-    lenses = {name: lens for name, lens in known.lenses.items() if name in found}
-    assumed = dict.fromkeys(one.assumed for one in found.values() if one.assumed)
-    warnings = tuple(f"{path}: {text}; audit tests other readings" for text in assumed)
-    return CameraFile(cameras, (), links, lenses, warnings)
+    return {
+        name: one._replace(camera=known.cameras[name], lens=known.lenses.get(name))
+        for name, one in found.items()
+    }
+
+
+def _read(path: Path, episode_ids: frozenset[str], largest: int = 1 << 29) -> Content:
+    """Return the content of a file, read by the library for its kind.
+
+    ``episode_ids``: of a `.jsonl`, only the lines that hold one of these names are read, if any do.
+    ``largest``: maximum size of the file [byte].
+
+    Raises CameraError: the file cannot be read, or is damaged.
+    """
+    try:
+        data = read_regular(path, largest)
+    except OSError as error:
+        raise CameraError(f"{path}: cannot read it: {error.strerror}") from error
+    text, fault = data.decode("utf-8", errors="replace"), ""
+    value: Any = None
+    lines = (line.strip() for line in io.StringIO(text))
+    first = next((line for line in lines if line and not line.startswith("#")), "")
+    try:
+        if data.startswith((b"\x93NUMPY", b"PK")):
+            kind = "NumPy"
+            loaded = np.load(io.BytesIO(data), allow_pickle=False)
+            value = np.atleast_1d(loaded) if isinstance(loaded, np.ndarray) else dict(loaded)
+        elif text.startswith("%YAML:1.0") or "<opencv_storage" in text[:200]:
+            kind = "FileStorage"
+            mode = cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY
+            storage = cv2.FileStorage(text, mode)
+            value = _plain(storage.root())
+        elif first.startswith("<"):
+            kind = "XML"
+            value = ElementTree.fromstring(data.lstrip())
+        elif path.suffix == ".json":
+            kind = "JSON"
+            value = json.loads(text, object_pairs_hook=_unique)
+        elif path.suffix == ".jsonl":
+            kind = "JSON"
+            records = [line for line in text.splitlines() if line.strip()]
+            own = [line for line in records if any(f'"{one}"' in line for one in episode_ids)]
+            value = [json.loads(line) for line in own or records]
+        elif re.fullmatch(r"\[[^\[\],{}]+\]|[\w.-]+\s*=.*", first):
+            kind = "TOML"
+            value = tomllib.loads(text)
+        elif re.fullmatch(r"[-+.,eE\d\s]+", first):
+            kind = "text"
+            value = np.loadtxt(io.StringIO(text.replace(",", " ")), ndmin=1)
+        else:
+            kind = "YAML"
+            value = read_yaml(path, CameraError)
+    # A launch file in Python, and what tf2_echo prints, are read as text.
+    except CameraError as error:
+        fault = str(error).removeprefix(f"{path}: ")
+    # What the libraries raise for damaged files is not documented. OpenCV's texts name its source.
+    except Exception as error:
+        why = "it is damaged" if kind == "FileStorage" else str(error)
+        raise CameraError(f"{path}: not a {kind} file: {why}") from error
+    return Content(path, value, text, fault, episode_ids)
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return a mapping of JSON; ValueError: a key is given twice."""
+    if len(dict(pairs)) < len(pairs):
+        raise ValueError("a key is given twice")
+    return dict(pairs)
+
+
+def _plain(node: Any) -> Any:
+    """Return a node of OpenCV's FileStorage as mappings, lists, arrays, texts and numbers."""
+    if node.isMap():
+        if {"rows", "cols", "data"} <= {*node.keys()}:
+            return np.asarray(node.mat(), dtype=np.float64)
+        return {name: _plain(node.getNode(name)) for name in node.keys()}  # noqa: SIM118
+    if node.isSeq():
+        return [_plain(node.at(k)) for k in range(node.size())]
+    return node.string() if node.isString() else node.real()
+
+
+def recording_names(recording: Path | None) -> tuple[frozenset[str], dict[str, str]]:
+    """Return an episode's names in files of many, and its cameras' serial numbers by DROID's role.
+
+    Both are those of `metadata_<episode ID>.json` in a raw folder of DROID, with the folder's own
+    names; the roles are ext1, ext2 and wrist.
+
+    recording: the recording's folder or file; None: unknown.
+    """
+    if recording is None:
+        return frozenset(), {}
+    folder = recording if recording.is_dir() else recording.parent
+    ids, serials = {recording.name, recording.stem, folder.name}, dict[str, str]()
+    for file in sorted(folder.glob("metadata_*.json")):
+        try:
+            content = dict(json.loads(read_regular(file, 1 << 20)))
+        except (OSError, ValueError, TypeError):
+            content = {}
+        names = [content[key] for key in ("uuid", "relative_path") if key in content]
+        ids |= {file.stem.removeprefix("metadata_"), *map(str, names)}
+        roles = {role: content.get(f"{role}_cam_serial") for role in ("ext1", "ext2", "wrist")}
+        serials |= {role: str(one) for role, one in roles.items() if one is not None}
+    return frozenset(ids), serials
+
+
+def _picture_sizes(recording: Path | None) -> dict[str, tuple[int, int]]:
+    """Return width and height [pixel] of the masks or pictures in a recording's folder, by camera.
+
+    They are those of each camera's first readable file; "" is a camera without a folder of its own.
+    """
+    found = dict[str, tuple[int, int]]()
+    for pattern in ("masks", "masks/*", "images/*"):
+        for folder in () if recording is None else recording.glob(pattern):
+            files = (one for one in folder.glob("[!.]*") if one.suffix.lower() in SUFFIXES)
+            with suppress(SceneError):
+                if (file := min(files, default=None)) and (size := picture_size(file)):
+                    found.setdefault("" if folder.name == pattern else folder.name, size)
+    return found
 
 
 def save_cameras(path: str | Path, cameras: Mapping[str, Camera] | Iterable[Camera]) -> None:
@@ -259,66 +352,30 @@ def dump_cameras(
     return yaml.safe_dump(content, sort_keys=False)
 
 
-def _find_configs(content: dict[Any, Any], path: Path) -> dict[str, Any] | None:
-    """Return unchecked CameraConfigs of a file's content by name; None if it is not one of Drake's.
+def _drake_cameras(content: Content) -> Parsed:
+    """Read Drake's cameras."""
+    # Import Drake only if needed, because it loads slowly.
+    from drake_pose.camera.exchange import drake_cameras
 
-    Raises CameraError: there are several scenarios, or one without a mapping of cameras.
-    """
-    if _is_config(content):
-        # Drake's default name of a camera.
-        return {str(content.get("name", "preview_camera")): content}
-    scenarios = (
-        {"": content}
-        if _is_scenario(content)
-        else {key: entry for key, entry in content.items() if _is_scenario(entry)}
-    )
-    if len(scenarios) > 1:
-        raise CameraError(
-            f"{path}: holds several scenarios ({', '.join(map(str, scenarios))}); keep only the "
-            "one with the cameras"
-        )
-    for scenario in scenarios.values():
-        cameras = scenario["cameras"]
-        if not isinstance(cameras, dict) or not cameras:
-            raise CameraError(f"{path}: cameras must be a mapping from names to CameraConfigs")
-        return cameras
-    if any(isinstance(entry, dict) and _is_config(entry) for entry in content.values()):
-        return content
-    return None
+    return drake_cameras(content)
 
 
-def _is_scenario(entry: Any) -> bool:
-    """Return whether an entry is a Drake Scenario: a mapping with `cameras`, no camera of ours."""
-    if not isinstance(entry, dict) or "cameras" not in entry:
-        return False
-    cameras = entry["cameras"]
-    return not isinstance(cameras, dict) or not {"X_WC", "width"} & set(cameras)
-
-
-def _is_config(entry: dict[Any, Any]) -> bool:
-    """Return whether an entry has a CameraConfig's fields, and none that only our cameras have."""
-    drake_fields = {
-        *("focal", "X_PB", "X_BC", "X_BD", "name", "fps", "rgb", "depth", "label", "show_rgb"),
-        *("clipping_far", "z_near", "z_far", "renderer_name", "renderer_class", "background"),
-        *("capture_offset", "output_delay", "do_compress", "lcm_bus"),
+def _own_cameras(content: Content) -> Parsed:
+    """Read this program's cameras, of which one has a field that others' cameras do not have."""
+    own = {"focal_x", "focal_y", "pixels_per_metre", "projection", "pixel_centers", "X_LC"}
+    entries = [one for one in content.mapping.values() if isinstance(one, dict)]
+    if not any(own & {*one} or {"X_WC", "center_x"} <= {*one} for one in entries):
+        return "no focal_x or pixels_per_metre"
+    if len({*map(str, content.mapping)}) < len(content.mapping):
+        raise CameraError(f"{content.path}: a camera is given twice, as a number and as a text")
+    return {
+        str(key): _read_camera(str(key), entry, content.path)
+        for key, entry in content.mapping.items()
     }
-    return bool(drake_fields & set(entry)) and not set(entry) & (
-        _FIELDS - {*_COMMON, "clipping_near"}
-    )
 
 
-def _check_name(key: Any, path: Path) -> str:
-    """Return a key of a camera file as a camera's name; CameraError if no folder can have it."""
-    name = str(key)
-    if not isinstance(key, str | int) or name in ("", ".", "..") or set(name) & set("/\\\0"):
-        raise CameraError(f"{path}: {name[:40]!r} is not a valid camera name")
-    return name
-
-
-def _read_camera(name: str, entry: Any, path: Path) -> Camera:
-    """Return the camera of one entry of a file, ignoring its distortion.
-
-    Its X_WC is the entry's X_WC or X_LC, or else the identity.
+def _read_camera(name: str, entry: Any, path: Path) -> Entry:
+    """Return the camera of one entry of a file.
 
     ``name``: the camera's name. ``entry``: the entry, not yet checked. ``path``: the file, for
     messages. Raises CameraError: a field is missing, unknown or invalid.
@@ -326,70 +383,70 @@ def _read_camera(name: str, entry: Any, path: Path) -> Camera:
     where = f"{path}: camera '{name}'"
     if not isinstance(entry, dict):
         raise CameraError(f"{where}: expected a mapping from field names to values")
-    projection = entry.get("projection", "pinhole")
-    if not isinstance(projection, str) or projection not in _REQUIRED:
+    kinds: dict[Any, Any] = {"pinhole": PinholeCamera, "parallel": ParallelCamera}
+    projection = str(entry.get("projection", "pinhole"))
+    if projection not in kinds:
         raise CameraError(f"{where}: projection must be pinhole or parallel")
-    required, optional = _REQUIRED[projection], _OPTIONAL[projection]
-    missing = [field for field in required if field not in entry]
+    kind = kinds[projection]
+    required = [one.name for one in fields(kind) if one.name not in ("name", "X_WC", "near")]
+    missing = [name for name in required if name not in entry]
     if missing:
         raise CameraError(f"{where}: a {projection} camera needs {', '.join(missing)}")
+    of_pinholes = ["link", "X_LC", "clipping_near", "distortion"] * (kind is PinholeCamera)
+    optional = ["X_WC", "projection", "pixel_centers", *of_pinholes]
     named_fields(entry, (*required, *optional), f"{where} ({projection})", CameraError)
-    pose = "X_WC"
-    if "link" in entry or "X_LC" in entry:
-        if not isinstance(entry.get("link"), str) or "X_LC" not in entry or "X_WC" in entry:
-            raise CameraError(
-                f"{where}: a camera that rides on a link has the link's name (link) and its pose "
-                "there (X_LC), and no X_WC"
-            )
-        pose = "X_LC"
-    values: dict[str, Any] = {"name": name, "X_WC": entry.get(pose, np.eye(4))}
-    values |= {field: entry[field] for field in required}
-    check_pose(values["X_WC"], pose, where)
-    pixel_centers = entry.get("pixel_centers", "integers")
-    if pixel_centers not in ("integers", "drake"):
+    pose, link = "X_LC" if {"link", "X_LC"} & {*entry} else "X_WC", entry.get("link", "")
+    if pose == "X_LC" and (
+        "X_WC" in entry or "X_LC" not in entry or not isinstance(link, str) or not link
+    ):
+        raise CameraError(
+            f"{where}: a camera that rides on a link has the link's name (link) and its pose "
+            "there (X_LC), and no X_WC"
+        )
+    centers = entry.get("pixel_centers", "integers")
+    if centers not in ("integers", "drake"):
         raise CameraError(
             f"{where}: pixel_centers must be integers (OpenCV's convention, the default) or drake "
-            f"(at i + 0.5), not {pixel_centers!r}"
+            f"(at i + 0.5), not {centers!r}"
         )
-    if pixel_centers == "drake":
-        for field in ("center_x", "center_y"):
-            values[field] = check_number(values[field], field, where) - HALF_PIXEL
-    if "clipping_near" in entry:
-        values["near"] = check_number(entry["clipping_near"], "clipping_near", where, positive=True)
+    values = {name: entry[name] for name in required}
+    values |= {"near": entry["clipping_near"]} if "clipping_near" in entry else {}
+    X = check_pose(entry[pose], pose, where) if pose in entry else None
     try:
-        return ParallelCamera(**values) if projection == "parallel" else PinholeCamera(**values)
+        camera: Camera = kind(name=name, X_WC=np.eye(4), **values)
     except CameraError as error:
         raise CameraError(f"{path}: {error}") from error
-
-
-def _read_lens(camera: Camera, value: Any, where: str) -> Lens | None:
-    """Return the lens of a camera with distortion; None if there is none.
-
-    The camera's intrinsics are those of the distorted images. ``value``: OpenCV's coefficients, not
-    yet checked; None or all 0: no distortion. Raises CameraError, begun by ``where``: they are
-    invalid.
-    """
-    if value is None:
-        return None
-    counts = (4, 5, 8, 12, 14)
-    if not isinstance(value, list) or len(value) not in counts:
-        raise CameraError(
-            f"{where}: distortion must be a list of OpenCV's coefficients: k1, k2, p1, p2, then k3 "
-            f"and more ({', '.join(map(str, counts))} numbers in all)"
-        )
-    D = np.array([check_number(one, "distortion", where) for one in value])
-    fx, fy, cx, cy = camera.kernel_parameters()[1:5]
-    K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-    return Lens(camera.width, camera.height, K, D) if D.any() else None
+    if centers == "drake":
+        x, y = camera.center_x - HALF_PIXEL, camera.center_y - HALF_PIXEL
+        camera = replace(camera, center_x=x, center_y=y)
+    if entry.get("distortion") is None:
+        return Entry(X, link, camera=camera)
+    K = matrix_of(*camera.kernel_parameters()[1:5])
+    lens = lens_of([camera.width, camera.height], K, entry["distortion"], "plumb_bob", where)
+    seen = lens.camera(name, np.eye(4)) if lens.distortion.any() else camera
+    return Entry(X, link, camera=seen, lens=lens)
 
 
 def describe_camera(camera: Camera) -> dict[str, Any]:
     """Return a camera's entry in a camera file, from field names to numbers, lists and texts."""
-    is_parallel = isinstance(camera, ParallelCamera)
-    focal = ("pixels_per_metre",) if is_parallel else ("focal_x", "focal_y")
-    fields = ("width", "height", *focal, "center_x", "center_y")
-    entry: dict[str, Any] = {"projection": "parallel"} if is_parallel else {}
-    entry |= {field: getattr(camera, field) for field in fields}
-    if isinstance(camera, PinholeCamera):
-        entry["clipping_near"] = camera.near
+    entry = {"projection": "parallel"} if isinstance(camera, ParallelCamera) else {}
+    names = [one.name for one in fields(camera) if one.name not in ("name", "X_WC")]
+    entry |= {"clipping_near" if one == "near" else one: getattr(camera, one) for one in names}
     return entry | {"X_WC": camera.X_WC.tolist()}
+
+
+PARSERS: Mapping[str, Parser] = {
+    "this program's cameras.yaml": _own_cameras,
+    "Kalibr": calibration_files.kalibr,
+    "URDF": pose_files.urdf,
+    "MuJoCo": pose_files.mujoco,
+    "launch file": pose_files.static_publishers,
+    "TransformStamped": pose_files.transforms,
+    "tf2_echo": pose_files.tf2_echo,
+    "OpenCV, ROS' camera_info, easy_handeye, a pose without a name": calibration_files.single,
+    "NAME: POSE, NAME: CameraInfo, TOML of anipose, Pose2Sim, Caliscope": calibration_files.by_name,
+    "NumPy array, list of poses": calibration_files.listed,
+    "DROID's files of many episodes": calibration_files.episodes,
+    "Drake": _drake_cameras,
+}
+"""Parsers of camera files, by the formats that they read, in the order in which they are tried."""

@@ -1,29 +1,56 @@
 """One recorded episode, as all readers return it, and checks of its time stamps."""
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
-from drake_pose.arrays import Array, Indices, Picture
+from drake_pose.arrays import Array, Indices, Mask, Picture
 from drake_pose.camera.models import Lens, PinholeCamera
 from drake_pose.camera.picture_files import frame_key
-from drake_pose.camera.servo_readings import Servos
+from drake_pose.camera.servo_readings import Column, Encoding, JointReadings, Servos
 from drake_pose.errors import SceneError, require_known
 
 
 @dataclass(frozen=True, eq=False)
 class JointLog:
-    """Joint positions as logged by a robot, in the log's units."""
+    """Joint positions by time or by frame: as a robot logged them, or in a model's joints."""
 
-    names: tuple[str, ...]  # Names of the joints in the log.
+    names: tuple[str, ...]  # Names of the joints.
     times: Array | None  # (n,) ascending times [s]; None: rows are identified by frames only.
-    positions: Array  # (n, m) positions; nan where there is no reading.
+    # (n, m) positions, nan where there is no reading; in the log's units, or in rad and m.
+    positions: Array
     # (n,) names or numbers of the rows' frames; empty: rows are identified by times only.
     frames: tuple[str, ...] = ()
     # Motors of the robot that LeRobot recorded; None: another recorder.
     servos: Servos | None = None
+    # Of a log in a model's joints, see `map_joints`: by name of each measured joint, the linear map
+    # from its column; the columns' readings, without those of a joint map; the angles' unit; in how
+    # many rows a reading is at an end of its range; assumptions and anomalies.
+    columns: Mapping[str, Column] = field(default_factory=dict)
+    readings: tuple[JointReadings, ...] = ()
+    unit: Encoding | None = None
+    clipped: Mask | None = None
+    warnings: tuple[str, ...] = ()
+    is_estimate: bool = False  # Whether it is the poses.csv of an estimate.
+    # (n, 7) poses of the base in the columns of such a file, if it moved.
+    bases: Array | None = None
+
+    @property
+    def not_logged(self) -> tuple[str, ...]:
+        """Names of a model's joints without a column."""
+        return tuple(name for name in self.names if name not in self.columns)
+
+    def only(self, rows: Indices) -> "JointLog":
+        """Return the log of k rows, given by their indices (k,)."""
+        return replace(
+            self,
+            times=None if self.times is None else self.times[rows],
+            positions=self.positions[rows],
+            frames=tuple(self.frames[k] for k in rows) if self.frames else (),
+        )
 
     def at(self, times: Array) -> Array:
         """Return (k, m) positions of all joints at times (k,) [s], interpolated linearly.
@@ -50,14 +77,18 @@ class JointLog:
         """
         if not self.frames:
             raise SceneError("the joint log's rows have times, but no frames")
-        rows = dict(zip(map(frame_key, self.frames), self.positions, strict=True))
         missing = np.full(len(self.names), np.nan)
-        return np.array([rows.get(frame_key(frame), missing) for frame in frames])
+        return np.array([self.by_frame.get(frame_key(frame), missing) for frame in frames])
+
+    @cached_property
+    def by_frame(self) -> dict[int | str, Array]:
+        """The positions (m,) of all joints by frame, see `frame_key`."""
+        return dict(zip(map(frame_key, self.frames), self.positions, strict=True))
 
 
 @dataclass(frozen=True, eq=False)
-class EpisodeCamera:
-    """One camera of an episode, and its n images."""
+class Stream:
+    """The n images of one camera of an episode, with their times."""
 
     name: str  # Name of the camera.
     # width, height: size of the images [pixel].
@@ -74,6 +105,21 @@ class EpisodeCamera:
     frames: tuple[str, ...] = ()  # (n,) names of the images; empty: they have none.
     lens: Lens | None = None  # Lens that undistorts the images; None: they have no distortion.
     is_posed: bool = False  # Whether X_WC was recorded, as the pose in the robot's base.
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the images (n,); six-digit numbers if they have none."""
+        return self.frames or tuple(f"{k:06d}" for k in range(len(self.times)))
+
+    def only(self, kept: Indices) -> "Stream":
+        """Return the stream of k images, given by their indices (k,)."""
+        if len(kept) == len(self.times):
+            return self
+        frames = tuple(self.frames[k] for k in kept) if self.frames else ()
+        read = self.read_recorded
+        return replace(
+            self, times=self.times[kept], frames=frames, read_recorded=lambda k: read(int(kept[k]))
+        )
 
     def pinhole(self) -> PinholeCamera:
         """Return the camera; without one, its focal length is 0.65 of the pictures' width."""
@@ -111,7 +157,7 @@ class Episode:
     """
 
     path: Path
-    cameras: Mapping[str, EpisodeCamera]
+    cameras: Mapping[str, Stream]
     joints: JointLog | None
     warnings: tuple[str, ...] = ()
 
@@ -119,14 +165,15 @@ class Episode:
     def checked(
         cls,
         path: Path,
-        cameras: Iterable[EpisodeCamera],
+        cameras: Iterable[Stream],
         joints: JointLog | None,
         reader_warnings: Iterable[str] = (),
         lacking: str = "",
     ) -> "Episode":
         """Return an episode with warnings of its reader and about its times and positions.
 
-        Infinite positions become nan.
+        Images without names, and rows, whose times do not ascend are left out. Infinite positions
+        become nan.
 
         Args:
             path: folder or file of the recording.
@@ -138,17 +185,25 @@ class Episode:
 
         Raises SceneError: there is no camera or no row, or images cannot be associated with rows.
         """
-        found, warnings = {camera.name: camera for camera in cameras}, list(reader_warnings)
+        found, warnings = dict[str, Stream](), list(reader_warnings)
+        for camera in cameras:
+            what, late = f"camera '{camera.name}'", list[str]()
+            if not camera.frames and np.isfinite(camera.times).any():
+                kept, late = ascending_indices(camera.times, f"{path}: {what}: pictures")
+                camera = camera.only(kept)
+            warnings += [*late, *_gap_warnings(camera.times, what, "picture")]
+            found[camera.name] = camera
         if not found:
             why = f": {'; '.join(warnings)}" if warnings else ""
             raise SceneError(f"{path}: has no camera's pictures{why}")
-        for name, camera in found.items():
-            warnings += _gap_warnings(camera.times, f"camera '{name}'", "picture")
         if joints is None:
             lacking = lacking or f"{path}: has no joint positions; give a table of them (--joints)"
             return cls(path, found, None, (*warnings, lacking))
         if not joints.positions.size:
             raise SceneError(f"{path}: the joint log has no row, or no joint")
+        if joints.times is not None:
+            kept, late = ascending_indices(joints.times, f"{path}: rows")
+            joints, warnings = joints.only(kept), warnings + late
         is_number = np.isfinite(joints.positions)
         if not is_number.any():
             raise SceneError(
@@ -168,7 +223,7 @@ class Episode:
             warnings += _comparison_warnings(path, camera, joints)
         return cls(path, found, joints, tuple(warnings))
 
-    def camera(self, name: str) -> EpisodeCamera:
+    def camera(self, name: str) -> Stream:
         """Return a camera by name.
 
         Raises UnknownNameError: there is no such camera.
@@ -228,14 +283,14 @@ def _gap_warnings(times: Array, what: str, one: str, gap: float = 1.5) -> list[s
     ]
 
 
-def _comparison_warnings(path: Path, camera: EpisodeCamera, joints: JointLog) -> list[str]:
+def _comparison_warnings(path: Path, camera: Stream, joints: JointLog) -> list[str]:
     """Return a warning if a camera's images and the joint log's rows do not match, else [].
 
     They are compared by frames if both have them, else by times: images outside the log's time
     span, or else a span of images shorter than 3/4 of the log's.
 
-    ``path``: the recording, for messages. ``camera``: the camera. ``joints``: the joint log. Raises
-    SceneError: no frame is in both, or they have neither frames nor times in common.
+    ``path``: the recording, for messages. Raises SceneError: no frame is in both, or they have
+    neither frames nor times in common.
     """
     count, where = len(camera.times), f"camera '{camera.name}'"
     if joints.frames and camera.frames:
@@ -262,9 +317,8 @@ def _comparison_warnings(path: Path, camera: EpisodeCamera, joints: JointLog) ->
     is_short = last - first < 0.75 * (end - begin)
     text = f"{where}: {outside} of {count} pictures are before or after the log {span}"
     short = f"{where}: its pictures cover only a part of the log {span}"
-    ratio = (end - begin) / (last - first) if last > first else 1.0
+    ratio = (end - begin) / (last - first) if last > first and end > begin else 1.0
     for unit, scale in (("ms", 1e3), ("microseconds", 1e6), ("ns", 1e9)):
-        short += f": are its times in {unit}?" if 0.7 * scale < ratio < 1.4 * scale else ""
-        is_larger = 0.7 * scale < 1.0 / max(ratio, 1e-12) < 1.4 * scale
-        text += f": are the pictures' times in {unit}?" if is_larger else ""
+        short += f": are its times in {unit}?" if 0.7 < ratio / scale < 1.4 else ""
+        text += f": are the pictures' times in {unit}?" if 0.7 < 1.0 / ratio / scale < 1.4 else ""
     return [text] if outside else [short] if is_short else []

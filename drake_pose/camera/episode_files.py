@@ -8,7 +8,7 @@ import json
 import math
 import os
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -19,25 +19,24 @@ from scipy.spatial.transform import Rotation
 from drake_pose.arrays import Array, Picture
 from drake_pose.camera.bags import BAGS, open_bag
 from drake_pose.camera.camera_files import CameraFile, intrinsics_of, load_camera_file
-from drake_pose.camera.episode import Episode, EpisodeCamera, JointLog, ascending_indices
+from drake_pose.camera.episode import Episode, JointLog, Stream, ascending_indices
 from drake_pose.camera.lerobot import INFO, open_lerobot
 from drake_pose.camera.models import Camera, Lens, PinholeCamera
 from drake_pose.camera.picture_files import (
     VIDEOS,
-    TimedVideo,
+    Video,
     find_pictures,
     find_recorded_files,
     frame_key,
     import_reader,
-    in_order,
+    naming_damage,
     read_picture,
 )
 from drake_pose.camera.pose_files import same_camera
-from drake_pose.camera.sources import CAMERAS, TIME_STAMPS, read_time_stamps
+from drake_pose.camera.sources import CAMERAS, TIME_STAMPS, picture_times
 from drake_pose.errors import CameraError, SceneError, SettingsError, listed
 from drake_pose.input_files import (
     named_fields,
-    pointer_hint,
     read_csv,
     read_number,
     read_regular,
@@ -82,11 +81,11 @@ def read_joint_table(path: Path) -> tuple[JointLog, list[str]]:
                     f"{path}: line {rows[k][0]}, column '{name}': '{cell[:40]}' is not a number"
                 ) from None
     positions = np.column_stack([values[name] for name in names])
-    if "time" not in values:
-        return JointLog(names, None, positions, frames), []
-    kept, warnings = ascending_indices(values["time"], f"{path}: rows")
-    frames = tuple(frames[k] for k in kept) if frames else ()
-    return JointLog(names, values["time"][kept], positions[kept], frames), warnings
+    log = JointLog(names, values.get("time"), positions, frames)
+    if log.times is None:
+        return log, []
+    kept, warnings = ascending_indices(log.times, f"{path}: rows")
+    return log.only(kept), warnings
 
 
 def open_folder(path: Path, joints: JointLog | None) -> Episode:
@@ -114,14 +113,11 @@ def open_folder(path: Path, joints: JointLog | None) -> Episode:
                 name, path / "images" / name, path / "scene.yaml", joints
             )
         elif files is not None:
-            # Frames are named as in a scene.
-            video = TimedVideo(files)
-            frames, times = tuple(f"{k:06d}" for k in range(len(video.times))), video.times
+            video = Video(files)
+            camera, camera_warnings = video_camera(name, video), video.warnings
             if joints is not None and joints.times is not None and joints.frames:
-                times = _times_of_rows(joints, frames)
-                times = video.times if np.isnan(times).all() else times
-            size, camera_warnings = (video.width, video.height), video.warnings
-            camera = EpisodeCamera(name, *size, times, None, None, video.read, frames)
+                times = _times_of_rows(joints, camera.frames)
+                camera = camera if np.isnan(times).all() else replace(camera, times=times)
         else:
             warnings.append(f"camera '{name}' of {CAMERAS} has no pictures; it is left out")
             continue
@@ -146,6 +142,13 @@ def open_folder(path: Path, joints: JointLog | None) -> Episode:
     return Episode.checked(path, cameras, joints, warnings)
 
 
+def video_camera(name: str, video: Video) -> Stream:
+    """Return a camera by a video; its frames are named as in a scene: 000000, 000001 and so on."""
+    frames = tuple(f"{k:06d}" for k in range(len(video.times)))
+    size = video.width, video.height
+    return Stream(name, *size, video.times, None, None, video.read, frames)
+
+
 def _span(times: Array) -> str:
     """Return the first and last of times [s], for messages."""
     return f"{times[0]:.3f} to {times[-1]:.3f} s"
@@ -160,63 +163,37 @@ def _times_of_rows(joints: JointLog, frames: Sequence[str]) -> Array:
 
 def _image_camera(
     name: str, folder: Path, scene: Path, joints: JointLog | None
-) -> tuple[EpisodeCamera, list[str]]:
+) -> tuple[Stream, list[str]]:
     """Return a camera whose images are in a folder, and warnings about incomplete frames.
 
     The times of its images are those of the folder's `timestamps.csv`, or else those of the same
     frames in the joint log, or else follow from the frame rate in scene.yaml, or else are nan.
 
-    ``name``: name of the camera. ``folder``: folder of the images. ``scene``: path of the
-    scene.yaml, which may be missing. ``joints``: joint log of the recording; None: none.
-
-    Raises SceneError: there is no image, or a file is unusable.
+    ``scene``: path of the scene.yaml, which may be missing. Raises SceneError: there is no image,
+    or a file is unusable.
     """
-    files, stamps, warnings = find_pictures(folder, name), folder / TIME_STAMPS, list[str]()
-    frames = in_order(files)
-    times = np.full(len(frames), np.nan)
-    if stamps.is_file():
-        stamped = read_time_stamps(stamps)
-        if lacking := sorted(stamped.keys() ^ files.keys()):
-            warnings.append(
-                f"{stamps}: {len(lacking)} frames have no picture, or no time, and are left out; "
-                f"the first is {lacking[0]}"
-            )
-        common = [frame for frame in stamped if frame in files]
-        kept, late = ascending_indices(np.array([stamped[frame] for frame in common]), str(stamps))
-        frames = tuple(common[k] for k in kept)
-        times, warnings = np.array([stamped[frame] for frame in frames]), warnings + late
-    elif joints is not None and joints.times is not None and joints.frames:
+    files, warnings = find_pictures(folder, name), list[str]()
+    is_logged = joints is not None and joints.times is not None and bool(joints.frames)
+    timed = picture_times(files, None if is_logged else read_sequence(scene)[1])
+    if lacking := sorted(timed.keys() ^ files.keys()):
+        warnings.append(
+            f"{folder / TIME_STAMPS}: {len(lacking)} frames have no picture, or no time, and are "
+            f"left out; the first is {lacking[0]}"
+        )
+    frames = tuple(frame for frame in timed if frame in files)
+    times = np.array([timed[frame] for frame in frames])
+    kept = np.arange(len(frames))
+    if np.isfinite(times).any():
+        kept, late = ascending_indices(times, str(folder / TIME_STAMPS))
+        warnings += late
+    elif joints is not None and is_logged:
         times = _times_of_rows(joints, frames)
-    else:
-        times = np.array([*picture_times(files, scene).values()])
-    pictures = [files[frame] for frame in frames]
-    height, width = read_picture(pictures[0], SceneError).shape[:2]
+    height, width = read_picture(files[frames[0]]).shape[:2]
 
     def recorded(k: int) -> Picture:
-        return read_picture(pictures[k], SceneError)
+        return read_picture(files[frames[k]])
 
-    return EpisodeCamera(name, width, height, times, None, None, recorded, frames), warnings
-
-
-def picture_times(files: Mapping[str, Path] | Path, scene: Path) -> dict[str, float]:
-    """Return the times [s] of a camera's frames by name; nan where unknown.
-
-    They are a video's own, or those in `timestamps.csv` beside picture files, or follow from the
-    frame rate.
-
-    ``files``: picture files by frame, or a video, whose frames are named 000000 and so on.
-    ``scene``: path of the scene.yaml with the rate, which may be missing. Raises SceneError: a file
-    is unreadable.
-    """
-    if isinstance(files, Path):
-        return {f"{k:06d}": float(time) for k, time in enumerate(TimedVideo(files).times)}
-    frames = in_order(files)
-    stamps = next(iter(files.values())).parent / TIME_STAMPS
-    if stamps.is_file():
-        known = read_time_stamps(stamps)
-        return {frame: known.get(frame, math.nan) for frame in frames}
-    rate = read_sequence(scene)[1] or math.nan
-    return {frame: k / rate for k, frame in enumerate(frames)}
+    return Stream(name, width, height, times, None, None, recorded, frames).only(kept), warnings
 
 
 def read_sequence(path: Path, sequence: bool = False) -> tuple[bool, float | None]:
@@ -240,7 +217,7 @@ def read_sequence(path: Path, sequence: bool = False) -> tuple[bool, float | Non
     return sequence, float(rate)
 
 
-def add_calibration(camera: EpisodeCamera, calibration: CameraFile, path: Path) -> EpisodeCamera:
+def add_calibration(camera: Stream, calibration: CameraFile, path: Path) -> Stream:
     """Return a recorded camera with its intrinsics, pose, link and lens of a camera file.
 
     A camera without entry in the file is returned as it is. ``path``: the file, for messages.
@@ -261,7 +238,7 @@ def add_calibration(camera: EpisodeCamera, calibration: CameraFile, path: Path) 
 
 
 def recorded_intrinsics(
-    cameras: Sequence[EpisodeCamera], path: Path, intrinsics: Path | None
+    cameras: Sequence[Stream], path: Path, intrinsics: Path | None
 ) -> CameraFile:
     """Return an episode's cameras with intrinsics, by their names in the episode.
 
@@ -353,28 +330,28 @@ def open_episode(
             f"--episode {episode}: {path} is a single episode, not a LeRobot data set"
         )
     inside = sorted(one.name for one in path.iterdir()) if path.is_dir() else []
-    bags = [path / name for name in inside if name.endswith(BAGS)]
+    bags = [path]
+    if path.is_dir() and "metadata.yaml" not in inside:
+        bags = [path / name for name in inside if name.endswith(BAGS)]
     if kind in ("", "folder") and any((path / "data").rglob("*.parquet")):
         raise SceneError(
             f"{path}: has the tables of a LeRobot data set, but no {INFO}, which says what they "
             "hold: copy the data set's folder meta"
         )
-    if kind == "lerobot":
-        found = open_lerobot(path, log, episode)
-    elif kind == "droid":
-        found = open_droid(path.parent if path.is_file() else path, log)
-    elif kind == "folder":
-        found = open_folder(path, log)
-    elif kind == "bag" and (path.is_file() or "metadata.yaml" in inside or len(bags) == 1):
-        found = open_bag(path if path.is_file() or "metadata.yaml" in inside else bags[0], log)
-    elif len(bags) > 1:
+    if kind == "bag" and len(bags) > 1:
         raise SceneError(
             f"{path}: has {len(bags)} bags and no metadata.yaml: give one of them, "
             f"{listed([one.name for one in bags])}, or write the file (ros2 bag reindex)"
         )
-    else:
+    if not kind:
         what = ", ".join(inside[:8]) if path.is_dir() else "a file of another kind"
         raise SceneError(f"{path}: is not an episode: {what or 'empty'}; {expected}")
+    found = {
+        "lerobot": lambda: open_lerobot(path, log, episode),
+        "droid": lambda: open_droid(path.parent if path.is_file() else path, log),
+        "bag": lambda: open_bag(bags[0], log),
+        "folder": lambda: open_folder(path, log),
+    }[kind]()
     return replace(found, warnings=(*warnings, *found.warnings))
 
 
@@ -391,8 +368,8 @@ def open_droid(path: Path, joints: JointLog | None) -> Episode:
     h5py = import_reader("h5py", path)
     where, folder = path / TRAJECTORY, path / "recordings" / "MP4"
     state, stamps = "observation/robot_state", "observation/timestamp/robot_state"
-    cameras: list[EpisodeCamera] = []
-    try:
+    cameras, warnings = list[Stream](), list[str]()
+    with naming_damage(where, "truncated or damaged"):
         require_regular(where)
         with h5py.File(where) as file:
             arm, gripper, start, end = (
@@ -410,14 +387,10 @@ def open_droid(path: Path, joints: JointLog | None) -> Episode:
                     "three times n are expected"
                 )
             times = 1e-3 * 0.5 * (start + end)
-            kept, warnings = ascending_indices(times, f"{where}: rows")
             names = (*(f"joint{k + 1}" for k in range(arm.shape[1])), "gripper_position")
-            own = JointLog(names, times[kept], np.column_stack([arm, gripper])[kept])
+            own = JointLog(names, times, np.column_stack([arm, gripper]))
             for video in sorted(folder.glob("*.mp4")):
                 cameras += _zed_cameras(file, video, warnings)
-    except (OSError, ValueError, LookupError, TypeError, RuntimeError) as error:
-        hint = pointer_hint(where)
-        raise SceneError(f"{where}: truncated or damaged: {error}{hint}") from error
     if not cameras:
         files = sorted(one for one in (path / "recordings").rglob("*") if one.is_file())
         found = listed([str(one.relative_to(path)) for one in files]) or "no recordings"
@@ -429,13 +402,23 @@ def open_droid(path: Path, joints: JointLog | None) -> Episode:
 
 
 def _dataset(file: Any, name: str, where: Path) -> Array:
-    """Return the numbers of a table of an open HDF5 file; SceneError (``where``): it is missing."""
+    """Return the numbers of a table of an open HDF5 file.
+
+    Raises SceneError (``where``): it is missing, or in another file.
+    """
     found = file
     for part in name.split("/"):
         inside = [*found] if hasattr(found, "keys") else ["a table"]
         if part not in inside:
             raise SceneError(f"{where}: has no {name}; {found.name} has: {', '.join(inside)}")
+        if other := getattr(found.get(part, getlink=True), "filename", None):
+            raise SceneError(
+                f"{where}: {found.name.rstrip('/')}/{part} is a link to {other}, and no other "
+                "file is opened: copy the table into this one"
+            )
         found = found[part]
+    if getattr(found, "external", None) or getattr(found, "is_virtual", False):
+        raise SceneError(f"{where}: the numbers of {name} are in other files: copy them into it")
     return np.asarray(found[()], dtype=np.float64)
 
 
@@ -446,33 +429,36 @@ def _zed_cameras(
     *,
     stereo: float = 2.5,
     calibrated: tuple[int, int] = (1280, 720),
-) -> list[EpisodeCamera]:
+) -> list[Stream]:
     """Return the camera of a video, or both cameras of a side-by-side stereo video.
 
     ``file``: the open trajectory (h5py.File). ``path``: the video, `<serial>.mp4` or
-    `<serial>-stereo.mp4`. ``warnings``: list to which warnings are appended. ``stereo``: minimum
-    ratio of width to height of a stereo video. ``calibrated``: width and height of the images to
-    which the intrinsics apply: HD720 [pixel].
+    `<serial>-stereo.mp4`. ``warnings``: appended to. ``stereo``: minimum ratio of width to height
+    of a stereo video. ``calibrated``: size of images to which intrinsics apply: HD720 [pixel].
     """
-    video, serial = TimedVideo(path), path.stem.removesuffix("-stereo")
+    video, serial = Video(path), path.stem.removesuffix("-stereo")
     times = _picture_times(file, path, serial, len(video.times), warnings)
-    kept, late = ascending_indices(times, f"{path}: pictures")
-    hand = file.get(f"observation/camera_type/{serial}")
-    is_on_hand = hand is not None and not np.any(hand[()])
+
+    def table(name: str) -> Array | None:
+        name = f"observation/{name}"
+        return _dataset(file, name, Path(file.filename)) if name in file else None
+
+    hand = table(f"camera_type/{serial}")
+    is_on_hand = hand is not None and not hand.any()
     if is_on_hand:
-        late.append(
+        warnings.append(
             f"camera '{serial}' is on the hand (camera_type 0): it moves with the arm; register "
             f"finds it on its link (--on LINK --camera {serial})"
         )
-    warnings += [*video.warnings, *late]
+    warnings += video.warnings
     sides = ("_left", "_right") if video.width > stereo * video.height else ("",)
     width, cameras = video.width // len(sides), []
     for k, side in enumerate(sides):
         name, camera, pose = f"{serial}{side}", None, None
         # A video of one camera is that of the left one.
         given = f"{serial}{side or '_left'}"
-        matrix = file.get(f"observation/camera_intrinsics/{given}")
-        rows = file.get(f"observation/camera_extrinsics/{given}")
+        matrix = table(f"camera_intrinsics/{given}")
+        rows = table(f"camera_extrinsics/{given}")
         if rows is not None and matrix is None:
             warnings.append(
                 f"camera '{name}': its recorded extrinsics are not used, as {file.filename} has no "
@@ -481,10 +467,10 @@ def _zed_cameras(
             )
         if matrix is not None:
             if rows is not None and not is_on_hand:
-                pose = recorded_pose(rows[()], name, warnings)
+                pose = recorded_pose(rows, name, warnings)
             X_WC = np.eye(4) if pose is None else pose
             try:
-                fx, _, cx, _, fy, cy = np.ravel(matrix[()])[:6].tolist()
+                fx, _, cx, _, fy, cy = np.ravel(matrix)[:6].tolist()
                 camera = PinholeCamera(name, *calibrated, fx, fy, cx, cy, X_WC)
                 camera = camera.resized(width, video.height)
             except (ValueError, TypeError, CameraError) as error:
@@ -496,13 +482,10 @@ def _zed_cameras(
                 )
 
         def recorded(number: int, begin: int = k * width) -> Picture:
-            picture = video.read(int(kept[number]))
-            return np.ascontiguousarray(picture[:, begin : begin + width])
+            return np.ascontiguousarray(video.read(number)[:, begin : begin + width])
 
         size, is_posed = (width, video.height), pose is not None
-        cameras.append(
-            EpisodeCamera(name, *size, times[kept], camera, None, recorded, is_posed=is_posed)
-        )
+        cameras.append(Stream(name, *size, times, camera, None, recorded, is_posed=is_posed))
     return cameras
 
 
@@ -550,9 +533,8 @@ def _picture_times(file: Any, path: Path, serial: str, count: int, warnings: lis
     exists, or else those of the trajectory's rows: of capture, reception or reading, by the first
     that there is.
 
-    ``file``: the open trajectory (h5py.File). ``path``: the video. ``serial``: serial number of the
-    camera. ``count``: number of images of the video. ``warnings``: list to which warnings are
-    appended.
+    ``file``: the open trajectory (h5py.File). ``path``: the video. ``serial``: the camera's serial
+    number. ``warnings``: appended to.
     """
     stamps = "observation/timestamp/cameras"
     kinds = ("estimated_capture", "frame_received", "read_end")

@@ -10,12 +10,10 @@ import math
 import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterable, Mapping
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import yaml
-from pydrake.common.schema import Rotation, Transform
+from pydrake.common.schema import Transform
 from pydrake.common.yaml import yaml_dump, yaml_dump_typed, yaml_load, yaml_load_typed
 from pydrake.geometry import (
     ClippingRange,
@@ -30,6 +28,7 @@ from scipy.spatial.transform import Rotation as Turn
 
 from drake_pose.arrays import Array
 from drake_pose.camera.models import HALF_PIXEL, Camera, PinholeCamera, camera_tuple
+from drake_pose.camera.pose_files import Content, Entry, Parsed
 from drake_pose.errors import CameraError
 
 
@@ -94,28 +93,13 @@ def camera_from_drake(
     the world; with a RenderCameraCore the pose of its body B.
     """
     pose = X_WC.GetAsMatrix4() if isinstance(X_WC, RigidTransform) else np.asarray(X_WC)
-    if isinstance(source, CameraInfo):
-        near, intrinsics = {}, source
-    else:
-        near, intrinsics = {"near": source.clipping().near()}, source.intrinsics()
+    near = PinholeCamera.near
+    if isinstance(source, RenderCameraCore):
         pose = pose @ source.sensor_pose_in_camera_body().GetAsMatrix4()
-    return _pinhole(name, intrinsics, pose, **near)
-
-
-def _pinhole(
-    name: str, source: CameraInfo | CameraConfig, X_WC: np.ndarray, near: float = PinholeCamera.near
-) -> PinholeCamera:
-    """Return the camera with Drake's intrinsics, shifted by half a pixel to our convention.
-
-    ``X_WC``: (4, 4) its pose in the world. ``near``: minimum visible depth [m].
-    """
-    if isinstance(source, CameraInfo):
-        size, center = (source.width(), source.height()), (source.center_x(), source.center_y())
-    else:
-        size, center = (source.width, source.height), source.principal_point()
-    focal = source.focal_x(), source.focal_y()
-    x, y = center[0] - HALF_PIXEL, center[1] - HALF_PIXEL
-    return PinholeCamera(name, *size, *focal, x, y, X_WC, near)
+        near, source = source.clipping().near(), source.intrinsics()
+    centre = source.center_x() - HALF_PIXEL, source.center_y() - HALF_PIXEL
+    size, focal = (source.width(), source.height()), (source.focal_x(), source.focal_y())
+    return PinholeCamera(name, *size, *focal, *centre, pose, near)
 
 
 def camera_to_config(camera: Camera) -> CameraConfig:
@@ -128,12 +112,6 @@ def camera_to_config(camera: Camera) -> CameraConfig:
     """
     camera = _require_pinhole(camera, "a CameraConfig")
     camera_to_drake(camera, renderer_name="any")
-    turn = _rigid_transform(camera.X_WC).rotation().ToAngleAxis()
-    rotation = Rotation()
-    rotation.value = Rotation.AngleAxis(angle_deg=math.degrees(turn.angle()), axis=turn.axis())
-    pose = Transform()
-    pose.rotation = rotation
-    pose.translation = camera.X_WC[:3, 3].tolist()
     config = CameraConfig(
         name=camera.name,
         width=camera.width,
@@ -142,7 +120,7 @@ def camera_to_config(camera: Camera) -> CameraConfig:
         center_x=camera.center_x + HALF_PIXEL,
         center_y=camera.center_y + HALF_PIXEL,
         clipping_near=camera.near,
-        X_PB=pose,
+        X_PB=Transform(_rigid_transform(camera.X_WC)),
         label=True,
     )
     # Drake refuses a depth range beyond the clipping planes.
@@ -152,54 +130,55 @@ def camera_to_config(camera: Camera) -> CameraConfig:
     return config
 
 
-def read_configs(entries: Mapping[str, Any], path: Path) -> dict[str, PinholeCamera]:
-    """Return the cameras of CameraConfig entries as read by ``read_yaml`` with tags, by name.
+def drake_cameras(content: Content) -> Parsed:
+    """Read a Scenario of Drake (possibly below one name), a mapping of CameraConfigs, or one.
 
     A camera's name is its ``name``, or else the entry's key. It is that of the colour and label
-    sensor, with X_WC = X_PB X_BC, which must be known and in the world.
+    sensor, with the pose X_PB X_BC, which must be known, in the world or on a link.
 
-    ``entries``: entries by key, not yet checked; None: all defaults. ``path``: the file, for
-    messages. Raises CameraError: names the file, the camera and the problem.
+    Raises CameraError: names the file, the camera and the problem; there are several scenarios, or
+    one without a mapping of cameras.
     """
-    cameras: dict[str, PinholeCamera] = {}
-    for key, entry in entries.items():
+    given, path, found = content.mapping, content.path, dict[str, Entry]()
+    levels = [one for one in (given, *given.values()) if isinstance(one, dict)]
+    scenarios = [one["cameras"] for one in levels if "cameras" in one]
+    names = {one.name for one in CameraConfig.__fields__} - {"width", "height"}
+    if len(scenarios) > 1:
+        raise CameraError(f"{path}: holds several scenarios; keep only the one with the cameras")
+    configs = scenarios[0] if scenarios else given
+    if scenarios and not (isinstance(configs, dict) and configs):
+        raise CameraError(f"{path}: cameras must be a mapping from names to CameraConfigs")
+    if not scenarios and names & {*given}:
+        # Drake's default name of a camera.
+        configs = {str(given.get("name", "preview_camera")): given}
+    elif not scenarios and not any(names & {*one} for one in levels):
+        return "no CameraConfig"
+    for key, entry in configs.items():
         where = f"{path}: camera '{key}'"
-        content = {} if entry is None else entry
-        if not isinstance(content, dict):
+        if not isinstance(entry, dict | None):
             raise CameraError(f"{where}: expected the fields of a CameraConfig")
         try:
-            config = yaml_load_typed(schema=CameraConfig, data=yaml_dump(content))
-            if "name" not in content:
-                config.name = str(key)
-            frame, own = config.X_PB.base_frame, f"camera '{config.name}'"
-            if frame not in (None, "", "world") or config.X_BC.base_frame not in (None, ""):
-                raise CameraError(
-                    f"{own}: its pose is given in '{frame or config.X_BC.base_frame}', but poses "
-                    "must be in the world: remove base_frame from X_PB and X_BC, and give the pose "
-                    "in the world"
-                )
-            poses = {"X_PB": config.X_PB, "X_BC": config.X_BC}
-            for name, pose in poses.items():
-                if not pose.IsDeterministic():
-                    raise CameraError(f"{own}: {name} is stochastic; give a deterministic pose")
-            X_PB, X_BC = (pose.GetDeterministicValue() for pose in poses.values())
-            X_WC = (X_PB @ X_BC).GetAsMatrix4()
-            camera = _pinhole(config.name, config, X_WC, near=config.clipping_near)
-        except CameraError as error:
-            raise CameraError(f"{path}: {error}") from error
-        # yaml_load_typed raises these; some values of CameraConfig even raise SystemExit.
-        except (
-            RuntimeError, ValueError, TypeError, KeyError, AttributeError, AssertionError,
-            SystemExit, yaml.YAMLError,
-        ) as error:  # fmt: skip
+            config = yaml_load_typed(
+                schema=CameraConfig, data=yaml_dump({"name": str(key), **(entry or {})})
+            )
+            # Drake writes a link's name after that of its model: arm::hand.
+            link = (config.X_PB.base_frame or "world").split("::")[-1]
+            is_known = config.X_PB.IsDeterministic() and config.X_BC.IsDeterministic()
+            if config.X_BC.base_frame or not is_known:
+                raise CameraError("X_PB or X_BC is stochastic, or X_BC has a base_frame")
+            core = config.MakeCameras()[0].core()
+            X_PB = config.X_PB.GetDeterministicValue()
+            camera = camera_from_drake(config.name, core, X_PB)
+        # yaml_load_typed raises many types, even SystemExit.
+        except (Exception, SystemExit) as error:
             # Drake's assertion that a field is a mapping only shows the value.
             bare = "expected NAME: VALUE fields, not " if isinstance(error, AssertionError) else ""
             why = " ".join(str(error).split())
             raise CameraError(f"{where}: invalid CameraConfig: {bare}{why}") from error
-        if camera.name in cameras:
-            raise CameraError(f"{path}: camera '{camera.name}' is given twice")
-        cameras[camera.name] = camera
-    return cameras
+        if config.name in found:
+            raise CameraError(f"{path}: camera '{config.name}' is given twice")
+        found[config.name] = Entry(camera.X_WC, "" if link == "world" else link, camera=camera)
+    return found
 
 
 def dump_scenario(
@@ -268,18 +247,25 @@ def ros_transforms(
     return _xml(launch)
 
 
-def mujoco_cameras(cameras: Mapping[str, Camera] | Iterable[Camera]) -> str:
+def mujoco_cameras(
+    cameras: Mapping[str, Camera] | Iterable[Camera], links: Mapping[str, str] | None = None
+) -> str:
     """Return XML with MuJoCo's <camera> elements, to be included in <worldbody>.
 
-    Cameras whose X_WC is the pose in a link belong into that link's <body> instead.
-
-    Raises CameraError: a parallel camera.
+    ``cameras``: the cameras, by name or in sequence. ``links``: link of each camera that is mounted
+    on one, by the camera's name; it stands in a <body> of that name, in whose frame its pose is.
+    None: all poses are in the world. Raises CameraError: a parallel camera.
     """
     root = ElementTree.Element("mujocoinclude")
+    text = " Include in <worldbody>; what is in a <body>, put into the robot's body of that name "
+    root.append(ElementTree.Comment(text))
+    bodies = {"": root}
     pixel = 1e-5  # Size of a sensor pixel [m]; arbitrary, because focal lengths are in pixels.
     R_CM = np.diag([1.0, -1.0, -1.0])  # From MuJoCo's frame, y up and z backward, to ours.
     for camera in camera_tuple(cameras):
         one = _require_pinhole(camera, "a camera of MuJoCo here")
+        if (link := (links or {}).get(camera.name, "")) not in bodies:
+            bodies[link] = ElementTree.SubElement(root, "body", {"name": link})
         turn = Turn.from_matrix(one.X_WC[:3, :3] @ R_CM).as_quat()
         middle = 0.5 * np.array([one.width - 1, one.height - 1])
         size = np.array([one.width, one.height])
@@ -292,7 +278,7 @@ def mujoco_cameras(cameras: Mapping[str, Camera] | Iterable[Camera]) -> str:
             "principalpixel": middle - [one.center_x, one.center_y],
         }
         texts = {key: " ".join(map(repr, value.tolist())) for key, value in fields.items()}
-        ElementTree.SubElement(root, "camera", {"name": one.name} | texts)
+        ElementTree.SubElement(bodies[link], "camera", {"name": one.name} | texts)
     return _xml(root)
 
 

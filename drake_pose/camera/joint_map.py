@@ -3,10 +3,9 @@
 import math
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from itertools import compress
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, cast, get_args
 
 import numpy as np
 
@@ -14,35 +13,22 @@ from drake_pose.arrays import Array, Mask
 from drake_pose.camera.episode import JointLog
 from drake_pose.camera.models import check_number
 from drake_pose.camera.servo_readings import (
+    UNITS,
     Column,
     Encoding,
-    ServoJoint,
+    JointReadings,
     Servos,
+    are_whole,
     is_gripper_name,
-    servo_columns,
-    servo_encoding,
+    is_of_arm,
+    is_of_servos,
+    is_share,
+    name_words,
+    range_in_steps,
+    unit_columns,
 )
 from drake_pose.errors import CameraError, SceneError, SettingsError, require_known
 from drake_pose.input_files import read_yaml
-
-UNITS = {"rad": 1.0, "deg": math.pi / 180.0}
-"""Units of angles [rad]."""
-
-
-@dataclass(frozen=True, eq=False)
-class MappedJoints:
-    """A joint log in the names, order and units of a model."""
-
-    # Positions by the model's names and order [rad or m]; nan for joints that are not logged.
-    log: JointLog
-    # (n, m) whether a reading is at an end of its range, so that the joint is there or beyond.
-    clipped: Mask
-    not_logged: tuple[str, ...]  # Names of the model's joints without a column.
-    warnings: tuple[str, ...]  # Assumptions that were made, and anomalies.
-    columns: Mapping[str, Column]  # By name of each logged joint, the linear map from its column.
-    # Of columns that LeRobot recorded from servos; None: they are angles or lengths.
-    encoding: Encoding | None = None
-    joints: tuple[ServoJoint, ...] = ()  # The joints with such columns; empty for None.
 
 
 def map_joints(
@@ -52,27 +38,32 @@ def map_joints(
     upper: Array,
     is_angle: Mask,
     *,
+    followers: Collection[str] = (),
     units: str | None = None,
     table: Mapping[str, Column] | None = None,
+    path: Path | None = None,
     slack: float = 0.1,
-) -> MappedJoints:
-    """Convert a joint log to a model's names, order and units.
+) -> JointLog:
+    """Return a joint log in a model's names, order and units [rad or m].
 
     Args:
         log: the joint log, in its own names and units.
         names: (m,) joints of the model.
         lower, upper: (m,) their limits, infinite if there are none [rad or m].
         is_angle: (m,) whether a joint is revolute.
-        units: of angles that are not in ``table``: "rad", "deg", or LeRobot's "normalised" or
-            "steps"; None: inferred from readings and limits.
+        followers: those of the joints that follow others; their columns are called like them.
+        units: of angles that are not in ``table``; None: inferred, see `find_unit`.
         table: linear maps of some joints by name, as from `read_joint_map`; the columns of other
             joints are found by `match_names`. None: no maps are given.
+        path: a table of positions: all its columns are joints, in radians and metres unless
+            their readings tell other units; None: it is a robot's log.
         slack: tolerance of the limits of angles [rad], and of lengths [the limits' length].
 
-    Returns the mapped log. Readings outside the joints' limits are kept, with a warning.
+    Returns the log; positions of joints that are not logged are nan. Readings outside the joints'
+    limits are kept, with a warning.
 
     Raises:
-        SceneError: no column is a joint, or the readings fit neither radians nor degrees.
+        SceneError: no column is a joint, or the readings fit no unit.
         UnknownNameError: the table has an unknown joint or column.
         SettingsError: unknown units.
     """
@@ -83,8 +74,12 @@ def map_joints(
     used = {column.name: None for column in columns.values()}
     require_known("column", used, log.names, "the joint log")
     readings_of = dict(zip(log.names, log.positions.T, strict=True))
-    others = {name: column for name, column in readings_of.items() if name not in used}
-    matched, warnings = _match(others, [name for name in names if name not in columns])
+    free = {name: column for name, column in readings_of.items() if name not in used}
+    wanted = [name for name in names if name not in columns]
+    matched, warnings = _match(free, wanted, followers)
+    if path is not None:
+        unknown = [name for name in free if name not in matched]
+        require_known("position", unknown, names, f"{path} has an unknown column; the model")
     if not (matched or columns):
         raise SceneError(
             f"no column of the joint log is a joint of the model: its columns are "
@@ -94,128 +89,236 @@ def map_joints(
     limits = {name: (low, high) for name, low, high in zip(names, lower, upper, strict=True)}
     angular = {name for name, turns in zip(names, is_angle, strict=True) if turns}
     servos = log.servos or Servos()
-    joints = _servo_joints(matched, others, limits, angular, servos)
-    encoding, texts = servo_encoding(joints, log.servos, units, slack)
-    warnings += texts
-    if encoding is not None:
-        servo_maps, texts = servo_columns(joints, servos, encoding)
-        columns, warnings = columns | servo_maps, warnings + texts
-        taken = {joint.column for joint in joints}
-        matched = {column: joint for column, joint in matched.items() if column not in taken}
-    else:
-        unit, is_mapped = UNITS.get(units or "rad", 1.0), bool(table)
-        matched, texts = _without_openings(matched, others, limits, unit, slack, is_mapped)
-        warnings += texts
-    revolute = {column: joint for column, joint in matched.items() if joint in angular}
-    if revolute and units is None:
-        angles = {column: readings_of[column] for column in revolute}
-        low, high = np.array([limits[joint] for joint in revolute.values()]).T
-        units, why = _find_unit(angles, np.array([*others.values()]), low, high, slack)
-        if why:
-            warnings.append(
-                f"angles of the joint log are assumed to be in {units}: {why}; if they are not, "
-                "give the unit (units)"
-            )
-    scale = UNITS.get(units or "rad", 1.0)
-    columns |= {j: Column(c, scale if c in revolute else 1.0) for c, j in matched.items()}
+    motors = match_names([*free], [*servos.motors])[0] if servos.motors else {}
+    joints = tuple(
+        JointReadings(
+            joint, column, free[column], *limits[joint], joint in angular,
+            path is None and is_gripper_name(joint), servos.motors.get(motors.get(column, "")),
+        )
+        for column, joint in matched.items()
+    )  # fmt: skip
+    largest = float(np.fmax.reduce(np.abs([*free.values()]), axis=None, initial=0.0))
+    usual: Encoding | None = None if path is None else "rad"
+    found = None if units else find_unit(joints, log.servos, largest, usual, slack)
+    unit, why = found or (cast(Encoding, units), "")
+    own, texts = unit_columns(joints, log.servos, unit, slack)
+    if is_of_servos(joints, log.servos, unit):
+        warnings.append(_servo_warning(servos, unit, why))
+    elif why:
+        warnings.append(
+            f"angles of the joint log are assumed to be in {unit}: {why}; if they are not, give "
+            "the unit (--units)"
+        )
+    columns, warnings = columns | own, warnings + texts
     positions = np.full((len(log.positions), len(names)), np.nan)
     clipped = np.zeros(positions.shape, dtype=np.bool_)
     for k, joint in enumerate(names):
         if joint in columns:
             column = columns[joint]
             positions[:, k], clipped[:, k], anomalies = _positions(
-                column, readings_of[column.name], limits[joint], is_angle[k], slack
+                log, column, readings_of[column.name], limits[joint], is_angle[k], slack
             )
             warnings += [f"joint '{joint}': column '{column.name}' {text}" for text in anomalies]
-    missing = tuple(name for name in names if name not in columns)
-    used_columns = {column.name for column in columns.values()}
-    unused = [name for name in log.names if name not in used_columns]
-    if missing:
-        warnings.append(
-            f"joints that are not logged: {', '.join(missing)}; hold them (--hold) or map columns "
-            "to them (joint map)"
-        )
+    used |= {column.name: None for column in columns.values()}
+    unused = [name for name in log.names if name not in used]
     if unused:
         warnings.append(f"columns of the joint log that are not joints: {', '.join(unused)}")
-    mapped = JointLog(tuple(names), log.times, positions, log.frames, log.servos)
-    return MappedJoints(mapped, clipped, missing, tuple(warnings), columns, encoding, tuple(joints))
+    return JointLog(
+        tuple(names), log.times, positions, log.frames, log.servos, columns, joints,
+        unit, clipped, tuple(warnings),
+    )  # fmt: skip
 
 
-def without_followers(
-    log: JointLog, followers: Mapping[str, Column], mapped: Collection[str] = ()
-) -> JointLog:
-    """Return a joint log without columns of followers of joints that have a column, too.
-
-    followers: see `follower_warnings`. mapped: columns that a joint map names; they stay.
-    """
-    gone = {name for name, one in followers.items() if one.name in log.names}.difference(mapped)
-    kept = [k for k, name in enumerate(log.names) if name not in gone]
-    names = tuple(log.names[k] for k in kept)
-    return replace(log, names=names, positions=log.positions[:, kept])
-
-
-def follower_warnings(
-    log: JointLog,
-    columns: Mapping[str, Column],
-    followers: Mapping[str, Column],
-    ranges: Mapping[str, float],
+def find_unit(
+    joints: Sequence[JointReadings],
+    servos: Servos | None,
+    largest: float,
+    usual: Encoding | None,
+    slack: float,
     *,
-    slack: float = 0.1,
-) -> list[str]:
-    """Return a warning of columns that contradict those of the joints that they follow.
+    full_turn: float = 2.0 * math.pi,
+    normalised: tuple[float, float] = (99.0, 100.001),
+    most: float = 720.0,
+    moves: float = 0.5,
+) -> tuple[Encoding, str]:
+    """Return the unit of all columns of angles, and the reason if it may be wrong.
+
+    The joints' limits and what moves decide; names of columns are a hint. Readings within the
+    limits as radians are radians if as degrees, or as LeRobot's -100 ... 100, the robot would
+    hardly move. Readings are degrees if they are within the limits as degrees, and as radians
+    exceed them by more than a full turn.
 
     Args:
-        log: the joint log.
-        columns: by joint the linear map from its column. A column with the joint's own name, and
-            without offset, is in the unit of its followers' columns; with others nothing is
-            compared.
-        followers: by a follower's name the linear map from its joint's position.
-        ranges: upper minus lower limit of each joint [rad or m].
-        slack: tolerance, the smaller of this [rad or m] and this fraction of the joint's range.
+        joints: the joints with their columns and motors. A gripper's readings are not regarded.
+        servos: the robot's motors; None: LeRobot did not record the log.
+        largest: largest magnitude of the readings of all columns whose unit is unknown.
+        usual: the unit if readings do not tell it; None: there is none.
+        slack: tolerance of the limits [rad].
+        full_turn: minimum excess of degrees over the limits as radians [rad]. A joint without
+            limits is assumed to stay within plus and minus twice this; with a usual unit it is
+            ignored.
+        normalised: a largest magnitude in this range, with the rounding of stored numbers, may be
+            that of normalised readings.
+        most: maximum magnitude of degrees, two turns [deg]; larger readings are steps.
+        moves: minimum range of a column's readings [rad] of a robot that moves.
+
+    Raises SceneError: the readings fit no unit, or several equally well.
     """
-    readings_of, off = dict(zip(log.names, log.positions.T, strict=True)), dict[str, float]()
-    for name, one in followers.items():
-        column = columns.get(one.name, Column(""))
-        if name not in readings_of or (column.name, column.offset) != (one.name, 0.0):
-            continue
-        implied = one.scale * column.scale * readings_of[one.name] + one.offset
-        differences = np.abs(column.scale * readings_of[name] - implied)
-        worst = float(np.fmax.reduce(differences, initial=0.0))
-        if worst > abs(one.scale) * min(slack, slack * ranges[one.name]):
-            off[name] = worst
-    if not off:
-        return []
-    name = max(off, key=lambda name: off[name])
-    one, more = followers[name], [other for other in off if other != name]
-    beside = f" (so do: {', '.join(more)})" if more else ""
-    return [
-        f"column '{name}' differs by up to {off[name]:.3g} [rad or m] from {one.scale:g} x "
-        f"'{one.name}' {one.offset:+g}, which it follows in the model (<mimic>){beside}: parts are "
-        "posed by the <mimic>, not by this column; if the column is right, poses and joint offsets "
-        "are wrong: correct the model"
+    body = [one for one in joints if one.is_angle and not one.is_gripper]
+    body = [
+        replace(one, readings=one.readings[np.isfinite(one.readings)])
+        for one in body or [one for one in joints if one.is_angle]
+        if np.isfinite(one.readings).any() and (usual is None or one.upper - one.lower < math.inf)
     ]
+    if not body:
+        return usual or "rad", ""
+    known, is_named = servos or Servos(), any(one.column.endswith(".pos") for one in body)
+    is_arm, (least, full) = is_of_arm(body, known), normalised
+    excess = {unit: [one.excess(UNITS[unit], 2.0 * full_turn) for one in body] for unit in UNITS}
+    in_rad, in_deg = (max(excess[unit]) <= slack for unit in ("rad", "deg"))
+    is_moved = max(high - low for low, high in (one.ends for one in body)) > moves
+    size = max(abs(end) for one in body for end in one.ends)
+    if in_rad and not (is_named or is_arm):
+        is_doubtful = usual is None and max(excess["deg"]) <= 0.0 and not is_moved
+        return "rad", "but as degrees they would be within the limits, too" * is_doubtful
+    if size > most and servos is not None:
+        # Only homed motors count below 0, or beyond a turn.
+        first, last = (-1, 2) if all(one.motor for one in body) else (0, 1)
+        if all(first * known.turn <= end <= last * known.turn for one in body for end in one.ends):
+            return "steps", f"they are up to {size:.0f}"
+    if size <= full and (is_named or is_arm):
+        unit, why = _servo_unit(body, known.turn)
+        if in_rad and is_moved and why.startswith("but") and not (is_named and is_arm):
+            return "rad", "as degrees or -100 ... 100 the robot would hardly move"
+        lacking = [one for one in body if range_in_steps(one, known.turn) is None]
+        is_known = not lacking or known.is_so or known.is_dynamixel
+        if unit == "normalised" and not (is_known and not (in_rad and why.startswith("but"))):
+            fitting = ["radians"] * in_rad + ["degrees"] * in_deg
+            what = "seem to be normalised to -100 ... 100, as in LeRobot"
+            what += f" (or could be {' or '.join(fitting)})" if fitting else ""
+            raise _refusal(
+                lacking or body, what + ", and their ranges are not known" * (not is_known)
+            )
+        if unit == "normalised" or is_arm or in_deg:
+            return unit, why
+    elif size > full and is_arm:
+        return "deg", f"the largest is {size:.4g}, not within -100 ... 100"
+    elif in_deg and max(excess["rad"]) > full_turn:
+        _refuse_mixed([one for one in body if one.excess(1.0) > slack], body, moves)
+        if not least <= largest <= full:
+            return "deg", "only as degrees all are within the limits"
+    if usual is not None:
+        return usual, ""
+    if least <= largest <= full:
+        raise _refusal(body, "seem to be normalised to -100 ... 100, as in LeRobot")
+    worst = body[int(np.argmax(excess["rad"]))]
+    raise _refusal(
+        body,
+        "are not all within the joints' limits as radians ('{}' is {:.4g} to {:.4g}, its joint's "
+        "limits are {:.4g} to {:.4g}), and not clearly degrees".format(
+            worst.column, *worst.ends, worst.lower, worst.upper
+        ),
+    )
 
 
-def motors_of(mapped: MappedJoints) -> list[tuple[ServoJoint, str]]:
-    """Return the mapped joints that have a motor in the calibration, each with the motor's name."""
-    servos = mapped.log.servos or Servos()
-    pairs = match_names([joint.column for joint in mapped.joints], [*servos.motors])[0]
-    used = [one for one in mapped.joints if one.column in pairs and one.name in mapped.columns]
+def _refusal(body: Iterable[JointReadings], what: str) -> SceneError:
+    """Return the error that readings of these joints have no clear unit."""
+    return SceneError(
+        f"the readings of the joint log ({', '.join(one.column for one in body)}) {what}: give "
+        "units (--units rad, deg, normalised for the joints' limits, or steps), put the robot's "
+        "calibration file into the data set or name it (--joint-map FILE), or give a joint map "
+        "with the range of each: JOINT: {column: COLUMN, from: [-100, 100], to: [LOWEST, HIGHEST]} "
+        "in radians"
+    )
+
+
+def _refuse_mixed(
+    in_degrees: Sequence[JointReadings], body: Sequence[JointReadings], moves: float
+) -> None:
+    """Raise SceneError if most joints would move by a few degrees about 0, unlike others.
+
+    ``in_degrees``: joints whose readings are not radians. ``moves``: see `find_unit`.
+    """
+    spans = [(one, one.ends[1] - one.ends[0]) for one in body if one not in in_degrees]
+    others = ", ".join(one.column for one, span in spans if span > moves)
+    if 2 * sum(span > moves for _, span in spans) > len(body):
+        raise SceneError(
+            f"the joint log's columns {', '.join(one.column for one in in_degrees)} are in "
+            f"degrees, but {others} seem to be in radians: give units: deg if all are in degrees, "
+            f"or a joint map: JOINT: {{column: {in_degrees[0].column}, unit: deg}}"
+        )
+
+
+def _servo_unit(body: Sequence[JointReadings], turn: int) -> tuple[Encoding, str]:
+    """Return the unit of servos' readings of at most 100, "deg" or "normalised", and the reason.
+
+    Encoders count in whole steps: a unit is right if readings are whole steps in it alone.
+
+    ``body``: the joints with finite readings. ``turn``: steps of a full turn.
+    """
+    # The middle of a range may be half a step.
+    if are_whole([2.0 * (turn - 1) / 360.0 * one.readings for one in body]):
+        return "deg", "only as degrees they are whole steps of an encoder"
+    counts = [(one, range_in_steps(one, turn)) for one in body]
+    if are_whole([(one.readings + 100.0) * n / 200.0 for one, n in counts if n]):
+        return "normalised", "only as -100 ... 100 of its range they are whole steps of an encoder"
+    for one in body:
+        if one.motor is not None and math.isfinite(one.motor.high):
+            half = 180.0 * (one.motor.high - one.motor.low) / turn
+            if max(-one.ends[0], one.ends[1]) > half + 2.0:
+                return "normalised", f"as degrees '{one.column}' would leave its range"
+    if any((np.abs(one.readings) == 100.0).any() for one in body):
+        return "normalised", "some are -100 or 100 exactly"
+    return "normalised", "but they could be degrees, too"
+
+
+def _servo_warning(servos: Servos, unit: Encoding, why: str) -> str:
+    """Return the warning that readings are taken for those of LeRobot's motors in a unit."""
+    source = "no calibration file of the robot is in or beside the data set"
+    source += f", so {servos.turn // 2} is taken for zero" if unit == "steps" else ""
+    source = f"their ranges are those of {servos.path}" if servos.path else source
+    what = {
+        "normalised": "LeRobot's -100 ... 100 of the motors' ranges",
+        "deg": "LeRobot's degrees",
+        "steps": f"encoder steps, {servos.turn} a turn",
+    }[unit]
+    return (
+        f"readings of the joint log are taken to be {what}{': ' if why else ''}{why}; {source}; "
+        "zeros set by hand are off by several degrees: estimate them (--zeros all)"
+    )
+
+
+def motors_of(log: JointLog) -> list[tuple[JointReadings, str]]:
+    """Return the joints of a log that have a motor in the calibration, each with its name."""
+    servos = log.servos or Servos()
+    pairs = match_names([joint.column for joint in log.readings], [*servos.motors])[0]
+    used = [one for one in log.readings if one.column in pairs and one.name in log.columns]
     return [(one, pairs[one.column]) for one in used]
 
 
 def _match(
-    readings: Mapping[str, Array], wanted: Sequence[str]
+    readings: Mapping[str, Array], names: Sequence[str], followers: Collection[str]
 ) -> tuple[dict[str, str], list[str]]:
     """Match columns to joints by `match_names`, or by the order of LeRobot's arms.
 
     If no column matches, a last column that can be a gripper's opening is left out. ``readings``:
-    (n,) by column. Returns the joint of each matched column, and warnings.
+    (n,) by column. ``followers``: those of ``names`` whose columns have the same words. Returns the
+    joint of each matched column, and warnings.
     """
+    wanted = [name for name in names if name not in followers]
+    following = {
+        column: name
+        for name in names
+        for column in readings
+        if name in followers and column not in wanted
+        if column == name or (name not in readings and name_words(column) == name_words(name))
+    }
+    readings = {column: own for column, own in readings.items() if column not in following}
     matched, warnings = match_names([*readings], wanted)
     *series, last = readings or ("",)
-    if not matched and _is_opening(readings.get(last, np.zeros(0))):
+    if not matched and is_share(readings.get(last, np.zeros(0))):
         matched, warnings = match_names(series, wanted)
+    matched |= following
     ordered = _in_order(readings, wanted)
     if len(ordered) > len(matched) and matched.items() <= ordered.items():
         pairings = ", ".join(f"{a} for {b}" for a, b in ordered.items())
@@ -234,81 +337,12 @@ def _in_order(columns: Iterable[str], joints: Sequence[str]) -> dict[str, str]:
     """
     names = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
     ends = [name.split("_") for name in names]
-    matches = [[column for column in columns if _words(column)[-len(end) :] == end] for end in ends]
+    matches = [
+        [column for column in columns if name_words(column)[-len(end) :] == end] for end in ends
+    ]
     if len(joints) not in (5, 6) or any(len(own) != 1 for own in matches):
         return {}
     return dict(zip((own[0] for own in matches), joints, strict=False))
-
-
-def _servo_joints(
-    matched: Mapping[str, str],
-    readings: Mapping[str, Array],
-    limits: Mapping[str, tuple[float, float]],
-    angular: Collection[str],
-    servos: Servos,
-) -> list[ServoJoint]:
-    """Return the matched joints that servos may move: revolute joints, and joints of grippers.
-
-    ``matched``: joint by column. ``readings``: (n,) by column. ``limits``: lower and upper limit by
-    joint [rad or m]. ``angular``: names of the revolute joints.
-    """
-    motors = match_names([*readings], [*servos.motors])[0] if servos.motors else {}
-    return [
-        ServoJoint(
-            joint, column, readings[column], *limits[joint], joint in angular,
-            is_gripper_name(_words(joint)), servos.motors.get(motors.get(column, "")),
-        )
-        for column, joint in matched.items()
-        if joint in angular or is_gripper_name(_words(joint))
-    ]  # fmt: skip
-
-
-def _is_opening(readings: Array) -> bool:
-    """Return whether readings (n,) can be a gripper's opening, 0 to 1."""
-    known = readings[np.isfinite(readings)]
-    return bool(known.size) and known.min() >= -0.001 and known.max() <= 1.001
-
-
-def _without_openings(
-    matched: Mapping[str, str],
-    readings: Mapping[str, Array],
-    limits: Mapping[str, tuple[float, float]],
-    unit: float,
-    slack: float,
-    is_mapped: bool,
-) -> tuple[dict[str, str], list[str]]:
-    """Return the matched columns without a gripper's openings, which are not joint positions.
-
-    Readings in 0 ... 1 may be an opening. A column of a gripper's joint is left out if:
-    - its name is not a gripper's, and readings are in 0 ... 1 or beyond the joint's limits; or
-    - its name is a gripper's, and readings are in 0 ... 1 and beyond the limits.
-
-    ``matched``: joint by column. ``readings``: (n,) readings by column. ``limits``: lower and upper
-    limit by joint [rad or m]. ``unit``: unit of the readings [rad]. ``slack``: tolerance of the
-    limits, the smaller of this [rad or m] and this fraction of their range. ``is_mapped``: whether
-    a joint map has other joints; then any gripper's column beyond the limits is left out.
-
-    Returns the joint of each column that is kept, and warnings about the other columns.
-    """
-    kept, warnings = dict(matched), list[str]()
-    for column, joint in matched.items():
-        is_named = column == joint or is_gripper_name(_words(column))
-        known = readings[column][np.isfinite(readings[column])]
-        least, most = known.min(initial=0.0), known.max(initial=0.0)
-        low, high = limits[joint]
-        room = min(slack, slack * (high - low))
-        is_within = low - room <= unit * least <= unit * most <= high + room
-        is_wrong = not is_within and (_is_opening(known) or is_mapped or not is_named)
-        is_guess = _is_opening(known) and not is_named
-        if is_gripper_name(_words(joint)) and (is_wrong or is_guess):
-            del kept[column]
-            warnings.append(
-                f"column '{column}' of the joint log, {least:.3g} to {most:.3g}, is not taken for "
-                f"joint '{joint}' ({low:.3g} to {high:.3g}): it seems to be a gripper's opening; "
-                f"map it if it is known ({joint}: {{column: {column}, from: [0, 1], to: [OPEN, "
-                "CLOSED]})"
-            )
-    return kept, warnings
 
 
 def match_names(logged: Sequence[str], wanted: Sequence[str]) -> tuple[dict[str, str], list[str]]:
@@ -327,7 +361,7 @@ def match_names(logged: Sequence[str], wanted: Sequence[str]) -> tuple[dict[str,
     for is_match in (lambda a, b: a == b, _is_suffix):
         unmatched = [name for name in logged if name not in matched]
         free = [name for name in wanted if name not in matched.values()]
-        pairs = [(a, b) for a in unmatched for b in free if is_match(_words(a), _words(b))]
+        pairs = [(a, b) for a in unmatched for b in free if is_match(name_words(a), name_words(b))]
         for a, b in pairs:
             if sum(a == c for c, _ in pairs) == 1 and sum(b == d for _, d in pairs) == 1:
                 matched[a] = b
@@ -335,7 +369,7 @@ def match_names(logged: Sequence[str], wanted: Sequence[str]) -> tuple[dict[str,
     starts_of = {
         name: found[1]
         for name in (*logged, *wanted)
-        if (found := re.fullmatch(r"(.*?)[_\-. ]?(\d+)", name))
+        if (found := re.fullmatch(r"(.*?)[_\-. ]?(\d+)", name.removesuffix(".pos")))
     }
     series = [name for name in logged if name in starts_of]
     starts = {starts_of[name] for name in series}
@@ -350,26 +384,13 @@ def match_names(logged: Sequence[str], wanted: Sequence[str]) -> tuple[dict[str,
             fitting = [one for one in {*begin} - {None} if begin.count(one) == len(series)]
             free = [a for a, b in zip(free, begin, strict=True) if fitting == [b]]
         if len(free) == len(series):
-            inorder = sorted(series, key=lambda name: int(_words(name)[-1]))
+            inorder = sorted(series, key=lambda name: int(name_words(name)[-1]))
             guesses |= dict(zip(inorder, free, strict=True))
             matched |= guesses
     if not guesses:
         return matched, []
     pairings = ", ".join(f"{a} for {b}" for a, b in guesses.items())
     return matched, [f"columns of the joint log are matched by similar names: {pairings}"]
-
-
-def _words(name: str) -> list[str]:
-    """Return the words in lower case and the numbers of a name, without affixes.
-
-    Affixes are a k before a capital letter, and the last words "joint" and "pos".
-    """
-    words = [word.lower() for word in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+", name)]
-    if len(words) > 1 and re.match("k[A-Z]", name):
-        words = words[1:]
-    while len(words) > 1 and words[-1] in ("joint", "pos"):
-        words = words[:-1]
-    return words
 
 
 def _is_suffix(a: Sequence[str], b: Sequence[str]) -> bool:
@@ -381,73 +402,8 @@ def _is_suffix(a: Sequence[str], b: Sequence[str]) -> bool:
     return any(word.isalpha() for word in short) and long[-len(short) :] == short
 
 
-def _find_unit(
-    readings: Mapping[str, Array],
-    others: Array,
-    lower: Array,
-    upper: Array,
-    slack: float,
-    *,
-    full_turn: float = 2.0 * math.pi,
-    normalised: tuple[float, float] = (99.0, 100.001),
-    moves: float = 0.5,
-) -> tuple[str, str]:
-    """Return the unit of columns of angles, "rad" or "deg", and the reason if it may be wrong.
-
-    Readings within the limits as radians are radians. Otherwise they are degrees if they are within
-    the limits as degrees, and as radians exceed them by more than a full turn.
-
-    ``readings``: readings (rows,) of the n columns of revolute joints, by name. ``others``: (k,
-    rows) readings of all columns whose units are unknown, including these. ``lower``, ``upper``:
-    (n,) limits of each column's joint [rad]. ``slack``: tolerance of the limits [rad].
-    ``full_turn``: maximum excess over the limits of readings in radians [rad]. A joint without
-    limits is assumed to stay within plus and minus twice this. ``normalised``: if the largest
-    magnitude of ``others`` is in this range, or a column's name ends in ".pos", LeRobot may have
-    normalised the readings to -100 ... 100. ``moves``: range of a column's readings above which
-    readings that may be radians are radians: as degrees the robot would stand still.
-
-    Raises SceneError: the readings fit neither radians nor degrees, or seem to be normalised.
-    """
-    low, high = np.maximum(lower, -2.0 * full_turn), np.minimum(upper, 2.0 * full_turn)
-    # fmin and fmax ignore missing readings (nan).
-    minima, maxima = (f.reduce(list(readings.values()), axis=1) for f in (np.fmin, np.fmax))
-    excess = {k: np.fmax(low - one * minima, one * maxima - high) for k, one in UNITS.items()}
-    worst = {unit: float(np.fmax.reduce(column)) for unit, column in excess.items()}
-    largest = np.fmax.reduce(np.abs(others), axis=None)
-    k = int(np.argmax(np.nan_to_num(excess["rad"])))
-    column = list(readings)[k]
-    reason = (
-        f"are not all within the joints' limits as radians ('{column}' is {minima[k]:.4g} to "
-        f"{maxima[k]:.4g}, its joint's limits are {lower[k]:.4g} to {upper[k]:.4g}), and not "
-        "clearly degrees"
-    )
-    is_named = any(name.endswith(".pos") for name in readings)
-    if is_named or normalised[0] <= largest <= normalised[1]:
-        reason = "seem to be normalised to -100 ... 100, as in LeRobot"
-    elif worst["rad"] <= slack:
-        doubtful = worst["deg"] <= 0.0 and np.fmax.reduce(maxima - minima) <= moves
-        return "rad", "but as degrees they would be within the limits, too" if doubtful else ""
-    elif worst["deg"] <= slack and worst["rad"] > full_turn:
-        in_degrees = excess["rad"] > slack
-        in_radians = ~in_degrees & (maxima - minima > moves)
-        if 2 * np.count_nonzero(in_radians) > len(readings):
-            # Most joints would move by a few degrees about 0.
-            one = next(iter(compress(readings, in_degrees)))
-            raise SceneError(
-                f"the joint log's columns {', '.join(compress(readings, in_degrees))} are in "
-                f"degrees, but {', '.join(compress(readings, in_radians))} seem to be in radians: "
-                f"give units: deg if all are in degrees, or a joint map: JOINT: {{column: {one}, "
-                "unit: deg}"
-            )
-        return "deg", "only as degrees all are within the limits"
-    raise SceneError(
-        f"the readings of the joint log ({', '.join(readings)}) {reason}: give units: rad or deg, "
-        "or a joint map with the range of each: JOINT: {column: COLUMN, from: [-100, 100], "
-        "to: [LOWEST, HIGHEST]} in radians"
-    )
-
-
 def _positions(
+    log: JointLog,
     column: Column,
     readings: Array,
     limits: tuple[float, float],
@@ -457,12 +413,14 @@ def _positions(
 ) -> tuple[Array, Mask, list[str]]:
     """Return a joint's positions (rows,), whether readings are clipped (rows,), and anomalies.
 
-    Anomalies are the ends of warnings. Positions of a revolute joint without limits are unwrapped.
+    Anomalies are the ends of warnings. Positions of a revolute joint without limits are unwrapped
+    in a log with times.
 
-    ``column``: the column's linear map and range. ``readings``: (rows,) readings [unit of the log].
-    ``limits``: lower and upper limit of the joint [rad or m]; infinite: none. ``is_angle``: whether
-    the joint is revolute. ``slack``: tolerance of the limits [rad; for lengths the range of the
-    limits]. ``at_end``: maximum distance of a clipped reading from an end of its range [the range].
+    ``log``: the log. ``column``: the column's linear map and range. ``readings``: (rows,) its
+    readings. ``limits``: lower and upper limit of the joint [rad or m]; infinite: none.
+    ``is_angle``: whether the joint is revolute. ``slack``: tolerance of the limits [rad; for
+    lengths the range of the limits]. ``at_end``: maximum distance of a clipped reading from an end
+    of its range [the range].
     """
     positions, anomalies = column.scale * readings + column.offset, list[str]()
     clipped = np.zeros(len(readings), dtype=np.bool_)
@@ -476,17 +434,27 @@ def _positions(
                 f"... {high:g}"
             )
     lower, upper = limits
-    if not math.isfinite(upper - lower):
-        # Unwrap: interpolation between readings at +-180 degrees must not pass through 0.
-        is_known = np.isfinite(positions)
-        positions[is_known] = np.unwrap(positions[is_known]) if is_angle else positions[is_known]
+    if not math.isfinite(upper - lower) or not len(positions):
+        if is_angle and log.times is not None:
+            # Unwrap: interpolation between readings at +-180 degrees must not pass through 0.
+            is_known = np.isfinite(positions)
+            positions[is_known] = np.unwrap(positions[is_known])
         return positions, clipped, anomalies
+    room = slack if is_angle else slack * (upper - lower)
     excess = np.nan_to_num(np.maximum(lower - positions, positions - upper), nan=-np.inf)
     row = int(np.argmax(excess))
-    if excess[row] > (slack if is_angle else slack * (upper - lower)):
+    if excess[row] > room:
+        where, value = f"frame {log.frames[row]}" if log.frames else f"row {row}", positions[row]
+        turned = value - math.copysign(2.0 * math.pi, value)
+        why = "is it the wrong column, offset, sign or unit?"
+        if is_angle and lower - room <= turned <= upper + room:
+            why = (
+                f"a full turn off, {turned:.4g}, it would not: does the encoder count a turn too "
+                "many, or are angles in degrees?"
+            )
         anomalies.append(
-            f"gives {positions[row]:.4g} in row {row}, outside the joint's limits {lower:.4g} to "
-            f"{upper:.4g}: is it the wrong column, offset, sign or unit?"
+            f"gives {value:.4g} {'rad' if is_angle else 'm'} in {where}, outside the joint's "
+            f"limits {lower:.4g} to {upper:.4g}: {why}"
         )
     return positions, clipped, anomalies
 

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from drake_pose.arrays import Array, Indices, Picture
-from drake_pose.camera.episode import Episode, EpisodeCamera, JointLog, ascending_indices
+from drake_pose.arrays import Array, Picture
+from drake_pose.camera.episode import Episode, JointLog, Stream
 from drake_pose.camera.lerobot_tables import (
     column_names,
     describe,
@@ -21,10 +21,10 @@ from drake_pose.camera.lerobot_tables import (
     stored_picture,
     with_fields,
 )
-from drake_pose.camera.picture_files import TimedVideo, import_reader
+from drake_pose.camera.picture_files import Video, import_reader, naming_damage, path_inside
 from drake_pose.camera.servo_readings import find_motors
 from drake_pose.errors import SceneError, UnknownNameError, listed
-from drake_pose.input_files import pointer_hint, read_regular
+from drake_pose.input_files import read_regular
 
 INFO = Path("meta", "info.json")
 """File by which LeRobot data sets are recognised."""
@@ -43,9 +43,7 @@ class _Rows(NamedTuple):
     number: int  # Number of the episode.
     table: Any  # Its table (pyarrow.Table).
     file: Path  # The table's file.
-    # stamps, kept: (k,) ascending times [s] and indices of the rows to use.
-    stamps: Array
-    kept: Indices
+    stamps: Array  # (n,) times of the rows [s].
     warnings: list[str]  # Is appended to.
 
 
@@ -62,23 +60,21 @@ def open_lerobot(path: Path, joints: JointLog | None, episode: int | None) -> Ep
     are present and none was chosen; UnknownNameError: the episode is not present.
     """
     parquet, warnings = import_reader("pyarrow.parquet", path), list[str]()
-    try:
+    with naming_damage(
+        path, "not a LeRobot data set of version 2 or 3, or a file of it is damaged"
+    ):
         info = _read_info(path)
         metadata, features = _episode_rows(path, info, parquet), info["features"]
         number = _choose_episode(path, info, metadata, episode)
         file = _file(path, info, metadata, number)
         table = _read_table(file, info, number, parquet, warnings)
         stamps = row_times(table, _rate(info), str(file), warnings)
-        kept, late = ascending_indices(stamps, f"{file}: episode {number}")
-        rows = _Rows(path, info, metadata, number, table, file, stamps[kept], kept, warnings)
+        rows = _Rows(path, info, metadata, number, table, file, stamps, warnings)
         warnings += [
-            *late,
-            *(
-                f"{path}: '{key}' is not used, as the data set has no intrinsics: give both in a "
-                "camera file (--cameras), or estimate the pose: drake-pose register"
-                for key in features
-                if "extrinsics" in key
-            ),
+            f"{path}: '{key}' is not used, as the data set has no intrinsics: give both in a "
+            "camera file (--cameras), or estimate the pose: drake-pose register"
+            for key in features
+            if "extrinsics" in key
         ]
         cameras, names = [], list[str]()
         pictures = [key for key, one in features.items() if is_picture(key, one)]
@@ -102,15 +98,6 @@ def open_lerobot(path: Path, joints: JointLog | None, episode: int | None) -> Ep
         if joints is None:
             own, lacking = _read_joints(rows)
         cameras, own, joints = _from_start(rows, cameras, own, joints)
-    except OSError as error:
-        what = f"{error.filename or path}: cannot be read: {error.strerror or error}"
-        raise SceneError(f"{path}: a file of it is damaged: {what}") from error
-    # Python and pyarrow raise these errors on damaged or incomplete files.
-    except (ValueError, LookupError, TypeError, AttributeError, NotImplementedError) as error:
-        raise SceneError(
-            f"{path}: not a LeRobot data set of version 2 or 3, or a file of it is damaged "
-            f"({type(error).__name__}: {error})"
-        ) from error
     return Episode.checked(path, cameras, joints or own, warnings, lacking)
 
 
@@ -123,13 +110,12 @@ def camera_name(key: str) -> str:
 def _read_info(path: Path) -> Mapping[str, Any]:
     """Return the content of `meta/info.json`.
 
-    Raises SceneError: it is no JSON, has no features, or the data set has another version.
+    Raises SceneError: it is no JSON, has no features, names files outside the data set, or is of
+    another version.
     """
     file = path / INFO
-    try:
+    with naming_damage(file, "is damaged: it is no JSON"):
         info = json.loads(read_regular(file))
-    except ValueError as error:
-        raise SceneError(f"{file}: a file of it is damaged: it is no JSON: {error}") from error
     features = info.get("features") if isinstance(info, dict) else None
     if not isinstance(features, dict) or not all(
         isinstance(one, dict) for one in features.values()
@@ -139,6 +125,10 @@ def _read_info(path: Path) -> Mapping[str, Any]:
             f"{file}: has no 'features', which name the columns and videos of the data set; it "
             f"has: {found or 'nothing'}"
         )
+    for key in ("data_path", "video_path"):
+        path_inside(path, str(info.get(key) or ""), f"{file}: {key}")
+    for key in features:
+        path_inside(path, key, f"{file}: features")
     version = str(info.get("codebase_version", "")).removeprefix("v")
     if not version:
         # The metadata of episodes are in tables since version 3.
@@ -168,29 +158,21 @@ def _episode_rows(
     They are in `meta/episodes/*/*.parquet` (version 3) or `meta/episodes.jsonl` (version 2).
     Without either file the episodes are numbered from 0 to `total_episodes` - 1.
 
-    ``path``: folder of the data set. ``info``: content of `meta/info.json`. ``parquet``: the module
-    pyarrow.parquet. Raises SceneError: the metadata are damaged.
+    ``parquet``: the module pyarrow.parquet. Raises SceneError: the metadata are damaged.
     """
     rows: dict[int, Mapping[str, Any]] = {}
     for file in sorted(path.glob("meta/episodes/*/*.parquet")):
         # Skip the statistics, which are most of the columns.
-        try:
+        with naming_damage(file, "is damaged: not a whole table with episode_index"):
             columns = parquet.read_schema(file).names
             used = [one for one in columns if one.startswith(("episode_index", "data/", "videos/"))]
             found = parquet.read_table(file, columns=used).to_pylist()
             rows |= {int(row["episode_index"]): row for row in found}
-        except (ValueError, LookupError, TypeError) as error:
-            what = f"not a whole table with episode_index: {error}{pointer_hint(file)}"
-            raise SceneError(f"{file}: a file of it is damaged: {what}") from error
     lines = path / "meta" / "episodes.jsonl"
     if not rows and lines.is_file():
         for k, line in enumerate(read_regular(lines).decode("utf-8", "replace").splitlines(), 1):
-            try:
+            with naming_damage(lines, f"is damaged: line {k} is no JSON with episode_index"):
                 rows |= {int(json.loads(line)["episode_index"]): {}} if line.strip() else {}
-            except (ValueError, LookupError, TypeError) as error:
-                raise SceneError(
-                    f"{lines}: a file of it is damaged: line {k} is no JSON with episode_index"
-                ) from error
     if not rows:
         count = len([*path.glob("data/**/*.parquet")])
         rows = {k: {} for k in range(_count(path, info, "total_episodes", count))}
@@ -249,12 +231,13 @@ def _file(
             )
             continue
         try:
-            files += [path / template.format(**values, file_index=index) for index in indices]
+            names = [template.format(**values, file_index=index) for index in indices]
         except (LookupError, ValueError, AttributeError) as error:
             raise SceneError(
                 f"{path / INFO}: the {which} '{template}' cannot be filled in ({error}); known "
                 f"words are {', '.join(values)}, file_index"
             ) from error
+        files += [path_inside(path, name, f"{path / INFO}: {which}") for name in names]
     found = next((file for file in files if file.is_file()), None)
     if found is None and lacking:
         raise SceneError(lacking)
@@ -293,7 +276,7 @@ def _read_table(
     ``number``: of the episode. ``warnings``: appended to. Raises SceneError: the table is damaged,
     or has no row of the episode.
     """
-    try:
+    with naming_damage(file, "is damaged: not a whole table"):
         schema = parquet.read_schema(file)
         available = schema.names
         used = [key for key in available if key in {*info["features"], "timestamp", "frame_index"}]
@@ -320,9 +303,6 @@ def _read_table(
                 "are used"
             )
             return parquet.read_table(file, columns=used)
-    except (ValueError, TypeError, NotImplementedError) as error:
-        what = f"not a whole table: {error}{pointer_hint(file)}"
-        raise SceneError(f"{file}: a file of it is damaged: {what}") from error
     found = listed([f"{one:g}" for one in others], 20)
     raise SceneError(
         f"{file}: is empty: it has no row of episode {number}"
@@ -352,10 +332,10 @@ def _read_joints(rows: _Rows) -> tuple[JointLog | None, str]:
     names = column_names(keys, [one.shape[1] for one in values], features)
     servos, texts = find_motors(path, str(rows.info.get("robot_type") or ""), names)
     rows.warnings.extend(texts)
-    return JointLog(names, rows.stamps, np.column_stack(values)[rows.kept], servos=servos), ""
+    return JointLog(names, rows.stamps, np.column_stack(values), servos=servos), ""
 
 
-def _read_camera(rows: _Rows, key: str) -> EpisodeCamera:
+def _read_camera(rows: _Rows, key: str) -> Stream:
     """Return a camera of an episode: of a video with its times, or of images with the rows' times.
 
     ``key``: the camera's feature. Raises SceneError: the camera's images are missing or damaged.
@@ -370,16 +350,14 @@ def _read_camera(rows: _Rows, key: str) -> EpisodeCamera:
     column = table[key] if key in table.column_names else None
 
     def recorded(k: int) -> Picture:
-        row = int(rows.kept[k])
-        cell = None if column is None else column[row]
-        shape = shape_of(feature)
-        return stored_picture(rows.path, rows.file, key, cell, shape, rows.number, row)
+        cell = None if column is None else column[k]
+        return stored_picture(rows.path, rows.file, key, cell, shape_of(feature), rows.number, k)
 
     height, width = recorded(0).shape[:2]
-    return EpisodeCamera(key, width, height, rows.stamps, None, None, recorded)
+    return Stream(key, width, height, rows.stamps, None, None, recorded)
 
 
-def _video_camera(rows: _Rows, key: str, file: Path) -> EpisodeCamera:
+def _video_camera(rows: _Rows, key: str, file: Path) -> Stream:
     """Return the camera of a video, restricted to an episode; times start at 0 with the episode.
 
     Images up to half a period before the start belong to the episode, and those after the end less
@@ -390,7 +368,7 @@ def _video_camera(rows: _Rows, key: str, file: Path) -> EpisodeCamera:
     or has no image in the episode.
     """
     row, count, warnings = rows.metadata[rows.number], rows.table.num_rows, rows.warnings
-    video, name = TimedVideo(file), key.removeprefix("observation.").removeprefix("images.")
+    video, name = Video(file), key.removeprefix("observation.").removeprefix("images.")
     where = f"videos/{key}"
     ends = [f"{where}/{end}_timestamp" for end in ("from", "to")]
     spans = np.array([[0.0, np.inf]])
@@ -435,12 +413,12 @@ def _video_camera(rows: _Rows, key: str, file: Path) -> EpisodeCamera:
         return video.read(first + k)
 
     times = video.times[first:last] - span[0]
-    return EpisodeCamera(name, video.width, video.height, times, None, None, recorded)
+    return Stream(name, video.width, video.height, times, None, None, recorded)
 
 
 def _from_start(
-    rows: _Rows, cameras: Sequence[EpisodeCamera], own: JointLog | None, given: JointLog | None
-) -> tuple[list[EpisodeCamera], JointLog | None, JointLog | None]:
+    rows: _Rows, cameras: Sequence[Stream], own: JointLog | None, given: JointLog | None
+) -> tuple[list[Stream], JointLog | None, JointLog | None]:
     """Return cameras and joint logs of an episode, their times counted from its start.
 
     The rows' times begin elsewhere, such as 1970, if they end after all videos. The times of videos
@@ -450,12 +428,12 @@ def _from_start(
     set's own log, with the times ``stamps``; None: none. ``given``: the user's log; None: none. It
     is moved, too, if it is from the rows' times.
     """
-    stamps = rows.stamps
-    period = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
+    stamps, known = rows.stamps, rows.stamps[np.isfinite(rows.stamps)]
+    period = float(np.median(np.diff(known))) if len(known) > 1 else 0.0
     videos = [one.times for one in cameras if one.times is not stamps]
-    end = max((float(times[-1]) for times in videos), default=float(stamps[-1] - stamps[0]))
-    start = float(stamps[0])
-    if start <= 0.5 * period or stamps[-1] <= end + 1.5 * period:
+    start, last = float(known[0]), float(known[-1])
+    end = max((float(times[-1]) for times in videos), default=last - start)
+    if start <= 0.5 * period or last <= end + 1.5 * period:
         return [*cameras], own, given
     rows.warnings.append(
         f"{rows.file}: the rows' times begin at {start:.6g} s, so they are counted from the first "

@@ -16,10 +16,17 @@ import cv2
 import numpy as np
 
 from drake_pose.arrays import Array, Picture
-from drake_pose.camera.episode import EpisodeCamera
-from drake_pose.camera.models import PinholeCamera, check_number, check_pose
-from drake_pose.camera.picture_files import decode_colours, import_reader, read_picture, upper_bits
-from drake_pose.errors import CameraError, SceneError, listed
+from drake_pose.camera.calibration_files import lens_of
+from drake_pose.camera.episode import Stream
+from drake_pose.camera.models import PinholeCamera, check_pose
+from drake_pose.camera.picture_files import (
+    decode_colours,
+    import_reader,
+    path_inside,
+    read_picture,
+    upper_bits,
+)
+from drake_pose.errors import SceneError, listed
 
 Features = Mapping[str, Mapping[str, Any]]
 """Features of a data set by name, as in `meta/info.json`."""
@@ -225,7 +232,7 @@ def stored_picture(
         shape: shape of an image in `meta/info.json`; empty: unknown.
         number: number of the episode.
 
-    Raises SceneError: it is missing or damaged.
+    Raises SceneError: it is missing, damaged, or outside the data set.
     """
     where = Path(f"{file}: '{key}', row {k}")
     if cell is not None:
@@ -236,7 +243,7 @@ def stored_picture(
         if isinstance(cell, dict):
             cell = cell.get("bytes") or cell.get("path")
         if isinstance(cell, bytes):
-            return decode_colours(cell, where, SceneError)
+            return decode_colours(cell, where)
         if not isinstance(cell, str):
             raise SceneError(
                 f"{where}: holds {kind if cell is not None else 'nothing'}, but an image file, "
@@ -255,13 +262,16 @@ def stored_picture(
         ]
     else:
         path = PurePath(cell.replace("\\", "/"))
-        tried = [root / path, file.parent / path]
+        if path.is_absolute():  # It is often that of the recorder's machine.
+            own = root.absolute()
+            path = path.relative_to(own if path.is_relative_to(own) else path.anchor)
+        tried = [path_inside(root, str(path), str(where)), file.parent / path]
         if "images" in path.parts:
             tried.append(root.joinpath(*path.parts[path.parts.index("images") :]))
         tried += [root / "images" / path, *(folder / path.name for folder in folders)]
     for place in tried:
         if place.is_file():
-            return read_picture(place, SceneError)
+            return read_picture(place)
     raise SceneError(f"{where}: no such image file; tried: {', '.join(map(str, tried))}")
 
 
@@ -271,18 +281,16 @@ def _array(cell: Any, given: Sequence[int], where: str) -> Array:
     A flat list has the shape that the data set states, ``given``. Raises SceneError, begun by
     ``where``: rows differ in length.
     """
-    shape, values = list[int](), cell.values
-    while values is not None and str(values.type).partition("<")[0].endswith("list"):
-        inner = values.flatten()
-        shape.append(len(values))
-        values, outer = inner, len(values)
-        if outer == 0 or len(inner) % outer:
-            raise SceneError(f"{where}: rows of an image differ in length")
+    values, sizes = cell.values, [1, len(cell.values)]
+    while str(values.type).partition("<")[0].endswith("list"):
+        values = values.flatten()
+        sizes.append(len(values))
+    if 0 in sizes or any(b % a for a, b in itertools.pairwise(sizes)):
+        raise SceneError(f"{where}: rows of an image differ in length")
+    shape = [b // a for a, b in itertools.pairwise(sizes)]
+    is_stated = len(shape) == 1 and math.prod(given) == len(values)
     flat = np.asarray(values.to_numpy(zero_copy_only=False))
-    sizes = [*shape, len(flat)]
-    lengths = [sizes[0], *(b // a for a, b in itertools.pairwise(sizes))]
-    is_stated = len(lengths) == 1 and math.prod(given) == len(flat)
-    return flat.reshape((tuple(given) if is_stated else ()) or lengths)
+    return flat.reshape(given if is_stated else shape)
 
 
 def _array_picture(values: Any, where: str) -> Picture:
@@ -300,7 +308,7 @@ def _array_picture(values: Any, where: str) -> Picture:
             "3 or 3 x height x width numbers are expected"
         )
     if layers.dtype == np.uint16:
-        layers = upper_bits(layers, where, SceneError)
+        layers = upper_bits(layers, where)
     if layers.dtype.kind == "f":
         layers = layers * (255.0 if np.nanmax(layers) <= 1.0 else 1.0)
     if not np.isfinite(layers).all() or layers.min() < 0 or layers.max() > 255:
@@ -328,7 +336,7 @@ def camera_fields(camera: PinholeCamera, link: str | None = None) -> dict[str, A
     }
 
 
-def with_fields(camera: EpisodeCamera, fields: Mapping[str, Any], where: str) -> EpisodeCamera:
+def with_fields(camera: Stream, fields: Mapping[str, Any], where: str) -> Stream:
     """Return a recorded camera with the intrinsics and pose in its feature's fields, if any.
 
     ``camera``: the recorded camera. ``fields``: fields of its feature and of the feature's `info`,
@@ -339,20 +347,8 @@ def with_fields(camera: EpisodeCamera, fields: Mapping[str, Any], where: str) ->
     if matrix is None and pose is None:
         return camera
     where = f"{where}: camera '{camera.name}'"
-    try:
-        K = np.asarray(matrix, dtype=np.float64)
-    except (TypeError, ValueError):
-        K = np.zeros(0)
-    if K.shape != (3, 3) or not (K[0, 0] > 0.0 and K[1, 1] > 0.0):
-        raise CameraError(
-            f"{where}: camera_intrinsics must be [[f_x, 0, c_x], [0, f_y, c_y], [0, 0, 1]] [pixel]"
-        )
-    fx, fy, cx, cy = (
-        check_number(float(K[place]), "camera_intrinsics", where)
-        for place in ((0, 0), (1, 1), (0, 2), (1, 2))
-    )
+    lens = lens_of([camera.width, camera.height], matrix, (), "none", f"{where}: camera_intrinsics")
     X_WC = np.eye(4) if pose is None else check_pose(pose, "camera_extrinsics", where)
-    link = fields.get("camera_link")
-    found = PinholeCamera(camera.name, camera.width, camera.height, fx, fy, cx, cy, X_WC)
+    found, link = lens.camera(camera.name, X_WC), fields.get("camera_link")
     is_posed = pose is not None and link is None
     return replace(camera, camera=found, link=link, is_posed=is_posed)

@@ -5,7 +5,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, TypeVar
+from typing import Any, Self
 
 import cv2
 import numpy as np
@@ -37,57 +37,67 @@ def check_number(value: Any, field: str, where: str, *, positive: bool = False) 
     message. ``positive``: refuse 0 and negative numbers.
     """
     try:
-        if isinstance(value, bool) or not isinstance(
-            value, int | float | str | np.integer | np.floating
-        ):
-            raise ValueError
-        number = float(value)
-        if not math.isfinite(number) or (positive and number <= 0.0):
-            raise ValueError
-    except (ValueError, OverflowError):
+        number = math.nan if isinstance(value, bool | np.ndarray) else float(value)
+    except (TypeError, ValueError, OverflowError):
+        number = math.nan
+    if not math.isfinite(number) or (positive and number <= 0.0):
         kind = "a finite positive number" if positive else "a finite number"
-        raise CameraError(f"{where}: {field} must be {kind}, not {_short(value)}") from None
+        raise CameraError(f"{where}: {field} must be {kind}, not {_short(value)}")
     return number
 
 
-def check_pose(value: Any, field: str, where: str) -> np.ndarray:
+def numbers(value: Any) -> Array | None:
+    """Return the finite numbers (n,), by rows, of an array or of small nested lists; or None.
+
+    ``value``: also a mapping whose ``data`` is one of these, as in ROS' files.
+    """
+    value = value.get("data") if isinstance(value, dict) else value
+    if not isinstance(value, list | tuple | np.ndarray) or not _is_small(value, 3):
+        return None
+    try:
+        found = np.asarray(value, dtype=np.float64).ravel()
+    except (ValueError, TypeError):
+        return None
+    return found if np.isfinite(found).all() else None
+
+
+def _is_small(value: Any, depth: int) -> bool:
+    """Return whether nested lists have few levels and entries; aliases of YAML may hold billions.
+
+    ``value``: the lists; anything else is small. ``depth``: maximum number of levels. A list may
+    have several times as many entries as a pose.
+    """
+    if not isinstance(value, list | tuple):
+        return True
+    return depth > 0 and len(value) <= 100 and all(_is_small(one, depth - 1) for one in value)
+
+
+def check_pose(value: Any, field: str, where: str, most: float = 1e-4) -> np.ndarray:
     """Return a rigid transform, Drake's or a matrix, as a read-only (4, 4) float64 array.
 
-    A rounded rotation R, with R R^T within 1e-4 of the identity, is replaced by the nearest exact
-    one, as Drake requires.
+    A rounded rotation R, with R R^T within ``most`` of the identity, is replaced by the nearest
+    exact one, as Drake requires.
 
     ``value``: the transform. ``field``, ``where``: field and start of the error message. Raises
     CameraError: not a finite 4 x 4 matrix, its last row is not 0 0 0 1, or it is not a rotation.
     """
-    value = value.GetAsMatrix4() if hasattr(value, "GetAsMatrix4") else value
-    rows = value.tolist() if isinstance(value, np.ndarray) else value
-    if not (
-        isinstance(rows, list | tuple)
-        and [len(row) if isinstance(row, list | tuple) else 0 for row in rows] == [4] * 4
-    ):
+    found = numbers(value.GetAsMatrix4() if hasattr(value, "GetAsMatrix4") else value)
+    if found is None or found.size != 16:
         raise CameraError(
-            f"{where}: {field} must be a 4 x 4 matrix of numbers, not {_short(value)}"
+            f"{where}: {field} must be a 4 x 4 matrix of finite numbers, not {_short(value)}"
         )
-    if isinstance(value, np.ndarray) and value.dtype.kind in "fiu":
-        matrix = np.array(value, dtype=np.float64)
-    else:
-        matrix = np.array([[check_number(entry, field, where) for entry in row] for row in rows])
-    if not np.all(np.isfinite(matrix)):
-        raise CameraError(f"{where}: {field} has entries that are not finite")
-    if not np.allclose(matrix[3], [0.0, 0.0, 0.0, 1.0], rtol=0.0, atol=1e-12):
+    matrix = found.reshape(4, 4).copy()
+    if np.abs(matrix[3] - [0.0, 0.0, 0.0, 1.0]).max() > 1e-12:
         raise CameraError(f"{where}: the last row of {field} must be 0 0 0 1")
     R = matrix[:3, :3]
     with np.errstate(over="ignore", invalid="ignore"):
         deviation = np.abs(R @ R.T - np.eye(3)).max()
-    if not deviation <= 1e-4:
+    if not deviation <= most or np.linalg.det(R) < 0.0:
+        kind = f"R R^T differs from the identity by {deviation:.3g}"
         raise CameraError(
-            f"{where}: the upper left 3 x 3 block of {field} is not a rotation (R R^T differs from "
-            f"the identity by {deviation:.3g}); its columns must be the camera's axes in the world"
-        )
-    if np.linalg.det(R) < 0.0:
-        raise CameraError(
-            f"{where}: the upper left 3 x 3 block of {field} is a reflection, not a rotation; "
-            "a camera's axes are x right, y down, z forward"
+            f"{where}: the upper left 3 x 3 block of {field} is not a rotation "
+            f"({'it is a reflection' if deviation <= most else kind}); its columns must be the "
+            "camera's axes in the world, x right, y down, z forward"
         )
     if deviation > 1e-13:
         U, _, Vt = np.linalg.svd(R)
@@ -99,12 +109,8 @@ def check_pose(value: Any, field: str, where: str) -> np.ndarray:
 
 def _short(value: Any) -> str:
     """Return a value as text of limited length, for messages."""
-    if isinstance(value, dict | list | tuple | set):
-        return f"a {type(value).__name__} of {len(value)}"
-    if isinstance(value, np.ndarray):
-        return f"an array of shape {value.shape}"
-    text = repr(value)
-    return text if len(text) <= 40 else text[:37] + "..."
+    is_plain = value is None or isinstance(value, str | int | float)
+    return repr(value)[:40] if is_plain else f"a {type(value).__name__}"
 
 
 class _PosedCamera:
@@ -136,12 +142,9 @@ class _PosedCamera:
         X_CW = self.X_CW
         return np.asarray(p_W, dtype=np.float64).reshape(-1, 3) @ X_CW[:3, :3].T + X_CW[:3, 3]
 
-    def with_pose(self: "_Camera", X_WC: np.ndarray) -> "_Camera":
+    def with_pose(self, X_WC: np.ndarray) -> Self:
         """Return the same camera at another pose X_WC (4, 4)."""
         return dataclasses.replace(self, X_WC=X_WC)  # type: ignore[type-var]
-
-
-_Camera = TypeVar("_Camera", bound=_PosedCamera)
 
 
 @dataclass(frozen=True, eq=False)
@@ -266,19 +269,14 @@ def camera_tuple(cameras: Mapping[str, Camera] | Iterable[Camera]) -> tuple[Came
 
     Raises CameraError: an element is not a camera, or a single camera is given.
     """
-    if isinstance(cameras, Camera):
+    given = cameras.values() if isinstance(cameras, Mapping) else cameras
+    found = tuple(given) if isinstance(given, Iterable) else (given,)
+    wrong = [type(one).__name__ for one in found if not isinstance(one, Camera)]
+    if wrong or isinstance(given, Camera):
         raise CameraError(
-            f"got one camera, '{cameras.name}', but several are expected: give [camera], or "
-            "{name: camera}"
+            f"got {(wrong or ['one camera'])[0]} where cameras are expected: give [camera], or "
+            "{name: camera} as from load_cameras"
         )
-    several = isinstance(cameras, Mapping | Iterable) and not isinstance(cameras, str | bytes)
-    found = tuple(cameras.values() if isinstance(cameras, Mapping) else cameras) if several else ()
-    for one in found if several else [cameras]:
-        if not isinstance(one, Camera):
-            raise CameraError(
-                f"got {type(one).__name__} where a camera is expected: give a PinholeCamera or a "
-                "ParallelCamera, as from load_cameras"
-            )
     return found
 
 
@@ -325,17 +323,20 @@ def circle_of_cameras(
         raise CameraError("a rig needs at least one camera")
     if not (0.0 < radius < math.inf and 0.0 < field_of_view < math.pi):
         raise CameraError("a rig's radius must be positive, its field of view below 180 degrees")
-    cameras = {}
+    views = list[tuple[str, list[float], Sequence[float], float]]()
     for k in range(count):
         angle = 2.0 * math.pi * (k + 0.5) / count
         eye = [radius * math.cos(angle), radius * math.sin(angle), height]
-        name = f"camera_{k}"
-        cameras[name] = _camera(name, look_at(eye, target), field_of_view, size)
+        views.append((f"camera_{k}", eye, target, field_of_view))
     if face_camera:
         # Height of an adult's face, and a narrow view in which the face fills the image.
         height, view = 1.6, math.radians(22.0)
-        face, eye = [target[0], target[1], height], [target[0] + radius, target[1], height]
-        cameras[FACE_CAMERA] = _camera(FACE_CAMERA, look_at(eye, face), view, size)
+        eye, face = [target[0] + radius, target[1], height], [target[0], target[1], height]
+        views.append((FACE_CAMERA, eye, face, view))
+    cameras, centre = {}, (0.5 * (size[0] - 1), 0.5 * (size[1] - 1))
+    for name, eye, point, view in views:
+        focal = 0.5 * size[1] / math.tan(0.5 * view)
+        cameras[name] = PinholeCamera(name, *size, focal, focal, *centre, look_at(eye, point))
     return cameras
 
 
@@ -358,19 +359,6 @@ def look_at(
     X_WC[:3, :3] = np.column_stack([right, np.cross(forward, right), forward])
     X_WC[:3, 3] = eye
     return X_WC
-
-
-def _camera(name: str, X_WC: Array, field_of_view: float, size: tuple[int, int]) -> PinholeCamera:
-    """Return a camera with square pixels and its principal point at the image's centre.
-
-    ``name``: name of the camera. ``X_WC``: (4, 4) pose of the camera in the world.
-    ``field_of_view``: vertical field of view [rad]. ``size``: width and height of the images
-    [pixel].
-    """
-    width, height = size
-    focal = 0.5 * height / math.tan(0.5 * field_of_view)
-    center = 0.5 * (width - 1), 0.5 * (height - 1)
-    return PinholeCamera(name, width, height, focal, focal, *center, X_WC)
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,10 +4,13 @@ import io
 import re
 import warnings
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from functools import reduce
 from importlib import import_module
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
 
+import av
 import cv2
 import numpy as np
 from PIL import Image, UnidentifiedImageError
@@ -46,43 +49,42 @@ def frame_key(cell: str) -> int | str:
     return cell if number is None else number
 
 
-def read_picture(path: Path, error_type: type[DrakePoseError]) -> Picture:
+def read_picture(path: Path) -> Picture:
     """Return a PNG or JPEG image (H, W, 3) red, green, blue.
 
-    Raises error_type: the file is unreadable; the message names it.
+    Raises SceneError: the file is unreadable; the message names it.
     """
     try:
-        return decode_colours(_read(path, error_type), path, error_type)
-    except error_type as error:
+        return decode_colours(_read(path), path)
+    except SceneError as error:
         if hint := pointer_hint(path):
-            raise error_type(f"{error}{hint}") from None
+            raise SceneError(f"{error}{hint}") from None
         raise
 
 
-def decode_colours(data: bytes, path: Path, error_type: type[DrakePoseError]) -> Picture:
+def decode_colours(data: bytes, path: Path) -> Picture:
     """Return an image (H, W, 3) red, green, blue from the ``data`` of a PNG or JPEG file.
 
-    Raises ``error_type``, which names the file at ``path``: the content is invalid.
+    Raises SceneError, which names the file at ``path``: the content is invalid.
     """
-    picture = _decode(data, cv2.IMREAD_COLOR, path, error_type)
+    picture = _decode(data, cv2.IMREAD_COLOR, path)
     return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 
 
-def picture_size(path: Path, error_type: type[DrakePoseError]) -> tuple[int, int] | None:
+def picture_size(path: Path) -> tuple[int, int] | None:
     """Return width and height [pixel] of a PNG or JPEG image, without decoding its pixels.
 
     The file is as whole as `read_picture` asks. None: a check needs the pixels, or the file's EXIF
-    data may turn the image. Raises ``error_type``, which names the file: it is unreadable.
+    data may turn the image. Raises SceneError, which names the file: it is unreadable.
     """
-    data = _read(path, error_type)
-    size = _require_whole(data, path, error_type)
+    data = _read(path)
+    size = _require_whole(data, path)
     is_deep_png = data[24:25] == b"\x10" and data.startswith(b"\x89PNG")
     return None if is_deep_png or b"eXIf" in data or b"Exif\0" in data else size
 
 
 def read_binary_mask(
     path: Path,
-    error_type: type[DrakePoseError],
     size: tuple[int | None, int | None] = (None, None),
     *,
     may_be_empty: bool = False,
@@ -92,66 +94,57 @@ def read_binary_mask(
 
     Args:
         path: the file.
-        error_type: class of the exceptions.
         size: required width and height [pixel]; None: any.
         may_be_empty: accept a mask without any object.
         lossy: accept JPEG files, too; their pixels of 128 or brighter are the object.
 
-    Raises error_type: the file is unreadable, damaged, of another size, empty or full, or has more
+    Raises SceneError: the file is unreadable, damaged, of another size, empty or full, or has more
     than two values; the message names it.
     """
-    data = _read(path, error_type)
-    picture = _decode(data, cv2.IMREAD_UNCHANGED, path, error_type, only_png=not lossy)
+    data = _read(path)
+    picture = _decode(data, cv2.IMREAD_UNCHANGED, path, only_png=not lossy)
     found = picture.shape[1], picture.shape[0]
     expected = size[0] or found[0], size[1] or found[1]
     if found != expected:
-        raise error_type(
+        raise SceneError(
             f"{path}: the mask has {found[0]} x {found[1]} pixels (width x height), but its camera "
             f"has {expected[0]} x {expected[1]}"
         )
-    layers = picture[:, :, None] if picture.ndim == 2 else picture
-    if layers.shape[2] == 4 and (layers[:, :, 3] == layers[0, 0, 3]).all():
-        layers = layers[:, :, :3]  # The alpha channel is constant.
-    elif layers.shape[2] == 4 and (layers[:, :, :3] == layers[0, 0, :3]).all():
-        layers = layers[:, :, 3:]  # Only the alpha channel varies.
+    layers = cv2.split(picture)
+    if len(layers) == 4:
+        # The alpha channel is left out if it is constant, and used alone if only it varies.
+        varies = [bool((one != one[0, 0]).any()) for one in layers]
+        layers = layers[:3] if not varies[3] else layers if any(varies[:3]) else layers[3:]
     if data.startswith(b"\xff\xd8"):
-        mask, is_one_colour = threshold_mask(picture, str(path), error_type), True
-    elif picture.ndim == 2:
-        mask = picture != 0
-        is_one_colour = np.count_nonzero(mask) == np.count_nonzero(
-            mask & (picture == picture.max())
-        )
+        mask, is_one_colour = threshold_mask(picture, str(path)), True
     else:
-        layers = np.ascontiguousarray(layers)
-        mask = cv2.inRange(layers, (0, 0, 0, 0), (0, 0, 0, 0)) == 0
-        first = np.atleast_1d(layers[np.unravel_index(mask.argmax(), mask.shape)])
-        colour = tuple(float(value) for value in first)
-        same = cv2.countNonZero(cv2.inRange(layers, colour, colour))
-        is_one_colour = not mask.any() or same == np.count_nonzero(mask)
+        mask = reduce(np.bitwise_or, layers) != 0
+        areas = [one[mask] for one in layers]
+        is_one_colour = not mask.any() or all(one.min() == one.max() for one in areas)
     if mask.all():
-        raise error_type(f"{path}: the mask is full (no black pixel): it shows no background")
+        raise SceneError(f"{path}: the mask is full (no black pixel): it shows no background")
     if not (may_be_empty or mask.any()):
-        raise error_type(f"{path}: the mask is empty (all black): it shows no object")
+        raise SceneError(f"{path}: the mask is empty (all black): it shows no object")
     if not is_one_colour:
-        values = len(np.unique(layers.reshape(-1, layers.shape[2]), axis=0))
-        raise error_type(
+        values = len(np.unique(np.stack(layers, axis=-1).reshape(-1, len(layers)), axis=0))
+        raise SceneError(
             f"{path}: the mask has {values} values, but must have two, black and one other on the "
             "object: threshold it first (or give the camera's source a background instead of masks)"
         )
     return np.asarray(mask, dtype=np.bool_)
 
 
-def list_pictures(folder: Path, error_type: type[DrakePoseError]) -> dict[str, Path]:
+def list_pictures(folder: Path) -> dict[str, Path]:
     """Return a folder's PNG and JPEG files by frame, the name without suffix, sorted by name.
 
-    Raises error_type: a frame occurs twice, with different suffixes.
+    Raises SceneError: a frame occurs twice, with different suffixes.
     """
     files: dict[str, Path] = {}
     for path in sorted(folder.iterdir()):
         # Skip hidden files, such as those of macOS.
         if path.suffix.lower() in SUFFIXES and not path.name.startswith("."):
             if path.stem in files:
-                raise error_type(f"{path}: the folder has frame {path.stem} twice; remove one")
+                raise SceneError(f"{path}: the folder has frame {path.stem} twice; remove one")
             files[path.stem] = path
     return files
 
@@ -163,7 +156,7 @@ def find_pictures(folder: Path, camera: str) -> dict[str, Path]:
     """
     if not folder.is_dir():
         raise SceneError(f"{folder}: no such folder of camera '{camera}'s pictures")
-    files = list_pictures(folder, SceneError)
+    files = list_pictures(folder)
     if not files:
         raise SceneError(f"{folder}: has no picture <frame>.png or .jpg of camera '{camera}'")
     return files
@@ -176,44 +169,42 @@ def find_recorded_files(folder: Path, camera: str) -> dict[str, Path] | Path | N
     Raises SceneError: a frame occurs twice.
     """
     if (own := folder / "images" / camera).is_dir():
-        return list_pictures(own, SceneError)
+        return list_pictures(own)
     videos = (folder / "videos" / f"{camera}{suffix}" for suffix in VIDEOS)
     return next((file for file in videos if file.is_file()), None)
 
 
-def threshold_mask(picture: Picture, where: str, error_type: type[DrakePoseError]) -> Mask:
+def threshold_mask(picture: Picture, where: str) -> Mask:
     """Return the mask (H, W) of the pixels with grey values of 128 or more.
 
     ``picture``: (H, W) grey values or (H, W, 3) colours of a lossily compressed mask. Raises
-    ``error_type``, begun by ``where``: over a tenth of the grey values are between 64 and 192.
+    SceneError, begun by ``where``: over a tenth of the grey values are between 64 and 192.
     """
     grey = picture if picture.ndim == 2 else cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
     between = float(((grey > 64) & (grey < 192)).mean())
     if between > 0.1:
-        raise error_type(
+        raise SceneError(
             f"{where}: {between:.0%} of it is neither dark nor light, so it is a picture and not a "
             "mask: segment the object first (drake-pose masks --background, or a network)"
         )
     return np.asarray(grey >= 128, dtype=np.bool_)
 
 
-def _read(path: Path, error_type: type[DrakePoseError]) -> bytes:
+def _read(path: Path) -> bytes:
     """Return a file's content, or raise the error."""
     try:
         return read_regular(path)
     except OSError as error:
-        raise error_type(f"{path}: cannot read the picture: {error.strerror}") from error
+        raise SceneError(f"{path}: cannot read the picture: {error.strerror}") from error
 
 
-def _decode(
-    data: bytes, how: int, path: Path, error_type: type[DrakePoseError], *, only_png: bool = False
-) -> Picture:
+def _decode(data: bytes, how: int, path: Path, *, only_png: bool = False) -> Picture:
     """Return a complete PNG or JPEG image as OpenCV decodes it: blue, green, red, or grey values.
 
-    ``data``, ``path``, ``error_type``, ``only_png``: as of `_require_whole`, whose errors are
+    ``data``, ``path``, ``only_png``: as of `_require_whole`, whose errors are
     raised. ``how``: OpenCV's reading mode, which determines the shape.
     """
-    _require_whole(data, path, error_type, only_png=only_png)
+    _require_whole(data, path, only_png=only_png)
     is_deep = how == cv2.IMREAD_COLOR and data[24:25] == b"\x10" and data[:1] != b"\xff"
     how |= cv2.IMREAD_ANYDEPTH if is_deep else 0
     try:
@@ -221,24 +212,22 @@ def _decode(
     except cv2.error:
         decoded = None
     if decoded is None:
-        raise error_type(f"{path}: not a whole PNG or JPEG picture")
-    return upper_bits(decoded, str(path), error_type) if is_deep else np.asarray(decoded)
+        raise SceneError(f"{path}: not a whole PNG or JPEG picture")
+    return upper_bits(decoded, str(path)) if is_deep else np.asarray(decoded)
 
 
-def _require_whole(
-    data: bytes, path: Path, error_type: type[DrakePoseError], *, only_png: bool = False
-) -> tuple[int, int]:
+def _require_whole(data: bytes, path: Path, *, only_png: bool = False) -> tuple[int, int]:
     """Return width and height of a complete PNG or JPEG image [pixel]; pixels are not decoded.
 
-    ``only_png``: refuse JPEG. Raises ``error_type``, which names ``path``: the content is no such
+    ``only_png``: refuse JPEG. Raises SceneError, which names ``path``: the content is no such
     image, damaged, or so large that it would fill the memory.
     """
     is_jpeg = data.startswith(b"\xff\xd8") and not only_png
     if is_jpeg and not data.rstrip(b"\0").endswith(b"\xff\xd9"):
-        raise error_type(f"{path}: the JPEG picture is truncated")
+        raise SceneError(f"{path}: the JPEG picture is truncated")
     # Check completeness here, because OpenCV's versions differ in decoding truncated images.
     if not (is_jpeg or data.startswith(b"\x89PNG\r\n\x1a\n")):
-        raise error_type(f"{path}: not a PNG{'' if only_png else ' or JPEG'} picture")
+        raise SceneError(f"{path}: not a PNG{'' if only_png else ' or JPEG'} picture")
     try:
         # Pillow only warns of decompression bombs up to twice its limit: raise there, too.
         with warnings.catch_warnings():
@@ -252,27 +241,56 @@ def _require_whole(
     ) as error:  # fmt: skip
         # Pillow's message for an unidentified image only has a memory address.
         why = "" if isinstance(error, UnidentifiedImageError) else f": {error}"
-        raise error_type(f"{path}: the picture is truncated, damaged or too large{why}") from error
+        raise SceneError(f"{path}: the picture is truncated, damaged or too large{why}") from error
     if max(width, height) > LARGEST_SIDE:
-        raise error_type(
+        raise SceneError(
             f"{path}: {width} x {height} pixels are too many: at most {LARGEST_SIDE} a side"
         )
     return width, height
 
 
-def upper_bits(picture: Any, where: str, error_type: type[DrakePoseError]) -> Picture:
+def upper_bits(picture: Any, where: str) -> Picture:
     """Return the upper 8 bits of an image's 16-bit values, in the same shape.
 
-    Raises ``error_type``, begun by ``where``: the values use fewer than 13 bits, so that the result
+    Raises SceneError, begun by ``where``: the values use fewer than 13 bits, so that the result
     would be black.
     """
     brightest = int(picture.max())
     if 0 < brightest < 1 << 12:
-        raise error_type(
+        raise SceneError(
             f"{where}: has 16 bits per pixel, but no value above {brightest} of 65535: scale its "
             "values to the whole range, or save the picture with 8 bits"
         )
     return np.asarray(picture >> 8, dtype=np.uint8)
+
+
+def path_inside(folder: Path, name: str, key: str) -> Path:
+    """Return the path of a file that a recording names by its path from the recording's folder.
+
+    ``key``: the key that has the name, and its file, for messages. Raises SceneError: the path is
+    absolute or has a part "..", so that a file outside the folder would be opened.
+    """
+    if PurePath(name).is_absolute() or ".." in PurePath(name.replace("\\", "/")).parts:
+        raise SceneError(
+            f"{key}: '{name}' leads out of {folder}, and no other file is opened: give a path "
+            "from that folder without '..', or put the files there"
+        )
+    return folder / name
+
+
+@contextmanager
+def naming_damage(path: Path, what: str) -> Iterator[None]:
+    """Convert any error that a library raises on a damaged file to a SceneError.
+
+    ``path``: the file. ``what``: what is wrong with it, for the message.
+    """
+    try:
+        yield
+    except DrakePoseError:
+        raise
+    except Exception as error:  # The libraries' errors have no common base class.
+        text = f"{path}: {what} ({type(error).__name__}: {error}){pointer_hint(path)}"
+        raise SceneError(text) from error
 
 
 def import_reader(library: str, path: Path) -> Any:
@@ -286,103 +304,27 @@ def import_reader(library: str, path: Path) -> Any:
         ) from error
 
 
-class VideoPictures:
-    """Images of a video, counted from 0, decoded by OpenCV, or by TimedVideo for AV1.
-
-    Attributes:
-        time: time of the last image read, relative to the first one [s].
-
-    Raises:
-        SceneError: the video cannot be read.
-    """
-
-    def __init__(self, path: Path) -> None:
-        if not path.is_file():
-            raise SceneError(f"{path}: no such video file")
-        self._path, self._capture, self._next = path, cv2.VideoCapture(str(path)), 0
-        self.time = 0.0
-        if not self._capture.isOpened():
-            raise SceneError(f"{path}: not a video that OpenCV can read")
-        codec = int(self._capture.get(cv2.CAP_PROP_FOURCC)).to_bytes(4, "little")
-        self._timed = TimedVideo(path) if codec.upper() == b"AV01" else None
-        # OpenCV counts the images of Matroska and WebM from their duration: those before the first
-        # one of a file that starts late are missing.
-        self._missing = 0
-        if path.suffix.lower() in (".mkv", ".webm") and hasattr(cv2, "CAP_PROP_PTS"):
-            self._capture.grab()
-            self._missing = max(0, int(self._capture.get(cv2.CAP_PROP_PTS)))
-            self._capture.release()
-            self._capture = cv2.VideoCapture(str(path))
-
-    @property
-    def count(self) -> int:
-        """Number of images according to the file."""
-        return int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT)) - self._missing
-
-    @property
-    def rate_hz(self) -> float | None:
-        """Images per second according to the file; None if unknown."""
-        rate = float(self._capture.get(cv2.CAP_PROP_FPS))
-        return rate if rate > 0.0 else None
-
-    def read(self, number: int) -> Picture:
-        """Return an image (H, W, 3) by its number from 0, red, green, blue, and set ``time``.
-
-        Raises SceneError: the video ends before it.
-        """
-        if self._timed is not None:
-            timed = self._timed.read(number)
-            self.time = float(self._timed.times[number] - self._timed.times[0])
-            return timed
-        if number < self._next:
-            self._capture.release()
-            self._capture, self._next = cv2.VideoCapture(str(self._path)), 0
-        # Not every video can seek, so images in between are skipped one by one.
-        while self._next < number and self._capture.grab():
-            self._next += 1
-        found, picture = self._capture.read()
-        if self._next < number or not found:
-            what = f"is truncated: it ends after {self._next} of {self.count} pictures"
-            what = what if number < self.count else f"has no picture {number}"
-            raise SceneError(
-                f"{self._path}: {what}; leave the rest out (--frame), or repair it: ffmpeg -i "
-                f"{self._path.name} -c copy NEW"
-            )
-        self._next += 1
-        self.time = 1e-3 * self._capture.get(cv2.CAP_PROP_POS_MSEC)
-        return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), dtype=np.uint8)
-
-    def require_before(self, number: int) -> None:
-        """Check that the images before the one just read can be decoded.
-
-        OpenCV has decoded them on its way.
-
-        Raises SceneError: an image cannot be decoded.
-        """
-        for earlier in range(number if self._timed is not None else 0):
-            self.read(earlier)
-
-
-class TimedVideo:
+class Video:
     """Images of a video with their times, decoded by PyAV.
 
     The next image costs one decoding; any other one is decoded from the preceding keyframe.
 
     Attributes:
+        path: the file.
         times: (n,) ascending times of the images [s]. Those of MP4, MOV, Matroska and WebM are the
             file's presentation times, so the first one may be later than 0. The clocks of AVI and
             MPEG begin anywhere: their times are relative to the first image.
+        promised: number of images according to the file; more than there are if it is truncated.
+        rate_hz: images per second according to the file; None if unknown.
         width, height: size of the images [pixel].
         warnings: problems of the file.
 
     Raises:
-        SceneError: it is not a video, has no image, is truncated and unreadable, or PyAV is
-            missing.
+        SceneError: it is not a video, has no image, or is truncated and unreadable.
     """
 
     def __init__(self, path: Path) -> None:
-        av = import_reader("av", path)
-        self._path, self._errors = path, (av.error.FFmpegError, OSError)
+        self.path, self._errors = path, (av.error.FFmpegError, OSError)
         try:
             require_regular(path)
             self._container = av.open(str(path))
@@ -397,13 +339,15 @@ class TimedVideo:
             raise SceneError(f"{path}: no picture has a time; ffmpeg -i {path.name} NEW.mp4 helps")
         self._stamps = np.array([pts for pts, _ in sorted(self._packets)])
         self._keys = np.array([pts for pts, is_key in sorted(self._packets) if is_key] or [0])
-        seconds = float(self._stream.time_base)
+        seconds = float(self._stream.time_base or 1)
         is_timeline = {"mp4", "webm"} & {*self._container.format.name.split(",")}
         self.times = (self._stamps - (0 if is_timeline else self._stamps[0])) * seconds
-        self._promised = self._stream.frames or len(self.times)
+        self.promised = self._stream.frames or len(self.times)
+        rate = self._stream.guessed_rate
+        self.rate_hz = float(rate) if rate else None
         self.warnings: list[str] = []
-        if self._promised > len(self.times):
-            text = f"it ends after {len(self.times)} of {self._promised} pictures"
+        if self.promised > len(self.times):
+            text = f"it ends after {len(self.times)} of {self.promised} pictures"
             self.warnings.append(f"{path}: is truncated: {text}")
         self._frames: Iterator[Any] = iter(())
         self._last: int | None = None
@@ -416,7 +360,7 @@ class TimedVideo:
                 if packet.pts is not None and not (packet.is_corrupt or packet.is_discard):
                     yield packet.pts, packet.is_keyframe
         except self._errors:
-            return  # Use the images so far; _promised reveals that some are missing.
+            return  # Use the images so far; ``promised`` reveals that some are missing.
 
     def _decode(self) -> Iterator[Any]:
         """Yield PyAV's frames from the current position; truncated packets are skipped."""
@@ -430,8 +374,8 @@ class TimedVideo:
         Raises SceneError: it is missing or damaged.
         """
         if not 0 <= number < len(self._stamps):
-            cut = "is truncated: it " if self._promised > len(self._stamps) else ""
-            raise SceneError(f"{self._path}: {cut}has pictures 0 to {len(self._stamps) - 1} only")
+            cut = "is truncated: it " if self.promised > len(self._stamps) else ""
+            raise SceneError(f"{self.path}: {cut}has pictures 0 to {len(self._stamps) - 1} only")
         wanted = int(self._stamps[number])
         key = int(self._keys[max(0, int(np.searchsorted(self._keys, wanted, side="right")) - 1)])
         previous = int(self._stamps[number - 1]) if number else None
@@ -453,4 +397,4 @@ class TimedVideo:
         except self._errors as error:
             reason = str(error)
         self._last = None
-        raise SceneError(f"{self._path}: picture {number} cannot be decoded: {reason}")
+        raise SceneError(f"{self.path}: picture {number} cannot be decoded: {reason}")

@@ -1,17 +1,13 @@
-"""Read files with poses of cameras but without their intrinsics.
+"""Read poses of cameras: matrices, translations with rotations, and frames of ROS and MuJoCo.
 
-Such are the results of easy_handeye (ROS 1 and 2) and MoveIt's hand-eye calibration, launch files
-and messages of static transforms, DROID's calibrations of its episodes (KarlP/droid, DROID-3D), and
-plain mappings from a camera's name to its pose. A pose is a matrix, a position with Euler angles,
-or a translation with a quaternion, a rotation vector, Euler angles or a matrix.
+A parser takes the content of a file, and returns the file's cameras or why it has another format.
 """
 
-import json
 import math
 import re
 import shlex
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,192 +15,268 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from drake_pose.arrays import Array
-from drake_pose.camera.models import check_pose, inverse_pose
-from drake_pose.errors import CameraError, listed
-from drake_pose.input_files import read_regular
+from drake_pose.camera.models import Camera, Lens, PinholeCamera, check_pose, inverse_pose, numbers
+from drake_pose.errors import CameraError
 
 END_EFFECTOR = "end effector"
 """Link of a camera on the robot's end effector whose file does not name the link."""
 
 
-class RecordedPose(NamedTuple):
-    """Pose of a camera's optical frame (x right, y down, z forward)."""
+class Entry(NamedTuple):
+    """One camera of a file."""
 
-    X: Array  # (4, 4) pose in the world, or in the link's frame [m].
-    link: str = ""  # Link on which the camera rides; "": it stands in the world.
+    # (4, 4) pose of its optical frame (x right, y down, z forward) in the world or, if it rides on
+    # a link, in the link's frame [m]; None: unknown.
+    X: Array | None = None
+    link: str = ""  # Link on which it rides, or END_EFFECTOR; "": it stands in the world.
     # How the file was read where it does not say so itself, for a warning; "": it does.
     assumed: str = ""
+    camera: Camera | None = None  # Its intrinsics, for undistorted images; None: unknown.
+    lens: Lens | None = None  # Its lens, for images as taken; None: unknown, or no distortion.
 
 
-def recorded_poses(
-    content: Any, path: Path, episode_ids: Collection[str] = ()
-) -> dict[str, RecordedPose]:
-    """Return the poses of the cameras in a file, by name; empty if it is not such a file.
+class Content(NamedTuple):
+    """Content of a camera file."""
 
-    ``content``: content of the file as plain values, as from ``read_camera_content``. ``path``: the
-    file, for messages and a camera without a name. ``episode_ids``: names by which the recording
-    may be known in a file of many episodes.
+    path: Path
+    value: Any  # Plain values, arrays, or an XML element; None: `fault` says why there are none.
+    text: str
+    fault: str = ""
+    episode_ids: frozenset[str] = frozenset()  # Names of the recording in files of many episodes.
+    # Width and height [pixel] of the recording's pictures by camera, where they are known.
+    sizes: Mapping[str, tuple[int, int]] = {}
 
-    Raises CameraError: a rotation is none, or it is unclear which of many episodes is meant.
+    @property
+    def mapping(self) -> dict[Any, Any]:
+        """The value; empty if it is no mapping."""
+        return self.value if isinstance(self.value, dict) else {}
+
+    def root(self, *tags: str) -> ElementTree.Element | None:
+        """Return the XML element if it has one of the tags."""
+        is_xml = isinstance(self.value, ElementTree.Element)
+        return self.value if is_xml and self.value.tag in tags else None
+
+
+Parsed = dict[str, Entry] | str
+"""The cameras of a file by name, or why the file has not a parser's format."""
+
+Parser = Callable[[Content], Parsed]
+
+
+def plain_key(key: Any) -> str:
+    """Return a key in lower case, without all but letters and digits."""
+    return re.sub(r"[^a-z0-9]", "", str(key).lower())
+
+
+def pose_of(value: Any, where: str) -> Entry | None:
+    """Return the pose in plain values; None: they are none.
+
+    ``value``: a matrix (4 x 4 or 3 x 4), [x, y, z, roll, pitch, yaw], [x, y, z, qx, qy, qz, qw], a
+    mapping with a translation and a rotation, or one with a pose below a name of poses. ``where``:
+    start of error messages. Raises CameraError: it is not a rigid transform.
     """
-    if isinstance(content, dict) and isinstance(content.get("transforms"), list):
-        content = content["transforms"]
-    if isinstance(content, list):
-        if not any(isinstance(one, dict) and "T0_ext1_in_world" in one for one in content):
-            return _transforms(content, path)
-        # Despite their names, these map the world to the camera.
-        keys = {"ext1": "T0_ext1_in_world", "ext2": "T1_ext2_in_world"}
-        content = {
-            str(one.get("episode_uuid", number)): {
-                name: {"world_to_camera": one[key]} for name, key in keys.items() if key in one
-            }
-            for number, one in enumerate(content)
-        }
-    if not isinstance(content, dict):
-        return {}
-    # Fields of this program's and Drake's cameras, which have intrinsics beside the pose.
-    own = {"width", "focal_x", "pixels_per_metre", "focal", "X_PB", "X_LC", "projection"}
-    if any(isinstance(one, dict) and own & {*one} for one in (content, *content.values())):
-        return {}
-    if _is_transform(content):
-        return _transforms([content], path)
-    if (alone := _pose_of(content, f"{path}")) is not None:
-        # The words of easy_handeye.
-        more = content.get("parameters")
-        words = content | (more if isinstance(more, dict) else {})
-        on_hand = words.get("eye_on_hand") is True or words.get("calibration_type") == "eye_in_hand"
-        link = str(words.get("robot_effector_frame") or END_EFFECTOR) if on_hand else ""
-        name = str(words.get("tracking_base_frame") or words.get("camera_name") or path.stem)
-        return {name: _optical(name, alone._replace(link=link))}
-    found = _poses_by_name(content, path)
-    if found:
-        return found
-    entries = {str(key): one for key, one in content.items() if isinstance(one, dict)}
-    groups = episode_entry(entries, path, episode_ids)
-    return _poses_by_name(groups, path) if groups else {}
+    if isinstance(value, dict):
+        keys = {plain_key(key): one for key, one in value.items()}
+        return _moved_and_turned(keys, where) or _named_pose(keys, where)
+    found = numbers(value)
+    if found is None or found.size not in (6, 7, 12, 16):
+        return None
+    if [side for side in np.shape(value) if side > 1][1:] not in ([], [4]):
+        return None
+    if found.size < 12:
+        turn = _rotation("rpy" if found.size == 6 else "quaternion", found[3:], where)
+        return None if turn is None else _rigid(turn[0], found[:3], where, turn[1])
+    matrix = np.eye(4)
+    matrix[: found.size // 4] = found.reshape(-1, 4)
+    return Entry(check_pose(matrix, "the pose", where, most=ROUNDED))
 
 
-def episode_entry(
-    entries: Mapping[str, Mapping[Any, Any]], path: Path, episode_ids: Collection[str]
-) -> Mapping[Any, Any] | None:
-    """Return the entry of one episode of a file that is keyed by episodes; None: it has none.
+ROUNDED = 0.01
+"""Maximum deviation of R R^T from the identity in files of poses, which may have few decimals."""
 
-    ``entries``: entries of the file by key. ``path``: the file, for messages. ``episode_ids``:
-    names by which the recording may be known. Raises CameraError: there are several, and none
-    belongs to the recording.
+
+def _rigid(R: Array, p: Array, where: str, assumed: str) -> Entry:
+    """Return the pose of a rotation (3, 3) and a translation (3,) [m]."""
+    X = np.eye(4)
+    X[:3, :3], X[:3, 3] = R, p
+    return Entry(check_pose(X, "the pose", where, most=ROUNDED), assumed=assumed)
+
+
+_HAND = "gripper|hand|flange|tool|tcp|eef?|endeffector|wrist"
+_BASE, _CAMERA, _END = f"(world|base|robot|{_HAND})", "cam(era)?", "(transform|matrix|pose)?"
+_INVERSE = re.compile(
+    f"[txh]?(cw|w2c|{_BASE}(to|2){_CAMERA}|{_CAMERA}t?{_BASE}|viewmatrix|extrinsiccv){_END}"
+)
+_POSE = re.compile(
+    f"[txh]?(wc|c2w|{_CAMERA}(to|2){_BASE}|{_BASE}t?{_CAMERA}|({_CAMERA})?(pose|extrinsics?)){_END}"
+    "|transform|transformation|matrix|calibration"
+)
+
+
+def _named_pose(keys: Mapping[str, Any], where: str) -> Entry | None:
+    """Return the first pose of a mapping, by plain keys, whose key says what it is; or None.
+
+    T_base_cam and cam_to_base are the camera's pose in the base, T_cam_base and base_to_cam the
+    inverse. A gripper or its like in place of the base means that the camera is on END_EFFECTOR.
     """
-    held = {
-        key: one
-        for key, one in entries.items()
-        if any(
-            _looks_posed(value)
-            # Four numbers, as DROID's intrinsics.
-            or (isinstance(value, list) and len(value) == 4 and _numbers(value) is not None)
-            for value in one.values()
-        )
+    # The results of cv2.calibrateHandEye are R_cam2gripper and t_cam2gripper.
+    pairs = {
+        key[1:]: {"r": one, "t": keys["t" + key[1:]]}
+        for key, one in keys.items()
+        if key.startswith("r") and "t" + key[1:] in keys
     }
-    own = [key for key in held if key in episode_ids]
-    if len(own) == 1 or len(held) == 1:
-        return held[(own or [*held])[0]]
-    if not held:
-        return None
-    known = f"this recording's are {listed(sorted(episode_ids))}" if episode_ids else (
-        "this recording has no metadata_<episode ID>.json that says which is its own"
-    )  # fmt: skip
-    raise CameraError(
-        f"{path}: has {len(held)} entries, from {next(iter(held))} on; {known}: keep only the "
-        "entry of the episode in the file"
-    )
+    for key, one in {**keys, **pairs}.items():
+        is_inverse = _INVERSE.fullmatch(key)
+        found = pose_of(one, where) if is_inverse or _POSE.fullmatch(key) else None
+        if found is not None and found.X is not None:
+            X = inverse_pose(found.X) if is_inverse else found.X
+            return found._replace(X=X, link=END_EFFECTOR if re.search(_HAND, key) else "")
+    return None
 
 
-def read_launch(text: str) -> list[dict[str, Any]] | None:
-    """Return the static transforms of a launch file (XML or Python) as TransformStamped messages.
+_MOVES = ("translation", "translationvector", "position", "pos", "trans", "xyz", "tvec", "t", "p",
+          "location")  # fmt: skip
+_TURNS = ("rotation", "rotationmatrix", "r", "rot", "mat", "orientation", "rvec", "rotvec",
+          "rotationvector", "rpy", "rpydeg", "euler", "eulerangles", "eulerdeg", "q", "quat",
+          "quaternion", "quatwxyz", "quaternionwxyz", "quatxyzw", "quaternionxyzw")  # fmt: skip
 
-    The result is None if the text is not such a file. Arguments of ``static_transform_publisher``
-    may be in order (x, y, z, then yaw, pitch, roll or a quaternion x, y, z, w, parent, child) or
-    named (--x, --qx, --frame-id ...).
+
+def _moved_and_turned(keys: Mapping[str, Any], where: str) -> Entry | None:
+    """Return the pose of a mapping, by plain keys, with a translation and a rotation; or None."""
+    places = [_together(keys, ("x", "y", "z")), *(keys.get(key) for key in _MOVES)]
+    for place in places:
+        if isinstance(place, dict):
+            place = _together(place, ("x", "y", "z")) or place
+        p = numbers(place)
+        if p is None or p.size != 3:
+            continue
+        turns = [("", keys)] if {"qx", "roll"} & {*keys} else []
+        for key, value in [*turns, *((key, keys.get(key)) for key in _TURNS)]:
+            if (turn := _rotation(key, value, where)) is not None:
+                return _rigid(turn[0], p, where, turn[1])
+    return None
+
+
+def _together(keys: Mapping[Any, Any], names: Sequence[str]) -> list[Any] | None:
+    """Return the values of a mapping's keys by their names; None: one is missing."""
+    plain = {plain_key(key): value for key, value in keys.items()}
+    return [plain[name] for name in names] if {*names} <= {*plain} else None
+
+
+def _rotation(key: str, value: Any, where: str) -> tuple[Array, str] | None:
+    """Return the rotation (3, 3) below a plain key, and what was assumed about it; None: none.
+
+    A quaternion is read as x, y, z, w, ROS' order, unless the key says wxyz. Three numbers are
+    roll, pitch and yaw about fixed axes, in degrees if the key says so or one is more than a turn
+    in radians, or else a rotation vector [rad].
     """
-    if "static_transform_publisher" not in text:
+    is_said = key.endswith(("wxyz", "xyzw"))
+    if isinstance(value, dict):
+        q = _together(value, ("qx", "qy", "qz", "qw")) or _together(value, ("x", "y", "z", "w"))
+        angles = _together(value, ("roll", "pitch", "yaw"))
+        is_said = is_said or bool(q or angles)
+        key, value = (key, q or value) if angles is None else (f"rpy{key}", angles)
+    found = numbers(value)
+    if found is None or found.size not in (3, 4, 9):
         return None
-    words, found, quaternion = list[list[str]](), list[dict[str, Any]](), ("qx", "qy", "qz", "qw")
-    if text.lstrip().startswith("<"):
+    if found.size == 9:
+        return found.reshape(3, 3), ""
+    if found.size == 4:
+        length = float(np.linalg.norm(found))
+        if abs(length - 1.0) > 2.0 * ROUNDED:
+            raise CameraError(f"{where}: its quaternion has the length {length:.3g}, not 1")
+        R = Rotation.from_quat(np.roll(found, -1) if key.endswith("wxyz") else found).as_matrix()
+        return R, "" if is_said else "its quaternion is read as x, y, z, w"
+    is_vector = key in ("rvec", "rotvec", "rotationvector")
+    in_degrees = not is_vector and ("deg" in key or float(np.abs(found).max()) > 2.0 * math.pi)
+    if in_degrees or key.startswith(("rpy", "euler")):
+        R = Rotation.from_euler("xyz", found, degrees=in_degrees).as_matrix()
+        unit = "deg" if in_degrees else "rad"
+        return R, "" if is_said else f"its angles are read as roll, pitch, yaw [{unit}]"
+    R = Rotation.from_rotvec(found).as_matrix()
+    return R, "" if is_vector else "its rotation is read as a rotation vector [rad]"
+
+
+def static_publishers(content: Content) -> Parsed:
+    """Read a launch file (XML or Python) of ROS with static transforms.
+
+    Arguments of ``static_transform_publisher`` may be in order (x, y, z, then yaw, pitch, roll or a
+    quaternion x, y, z, w, parent, child) or named (--x, --qx, --frame-id ...).
+    """
+    name = "static_transform_publisher"
+    texts, found, quaternion = list[str](), list[dict[str, Any]](), ("qx", "qy", "qz", "qw")
+    if (launch := content.root("launch")) is not None:
+        nodes = [one for one in launch.iter("node") if name in (one.get("type"), one.get("exec"))]
+        texts = [node.get("args", "") for node in nodes]
+    elif "LaunchDescription" in content.text or "Node(" in content.text:
+        blocks = content.text.split(name)[1:]
+        lists = [re.search(r"arguments\s*=\s*\[(.*?)\]", one, re.DOTALL) for one in blocks]
+        texts = [one[1].replace(",", " ") for one in lists if one is not None]
+    for text in texts:
         try:
-            root = ElementTree.fromstring(text)
-        except ElementTree.ParseError:
-            return None
-        for node in root.iter("node"):
-            if "static_transform_publisher" in (node.get("type"), node.get("exec")):
-                words.append(shlex.split(node.get("args", "")))
-    else:
-        for block in text.split("static_transform_publisher")[1:]:
-            own = re.search(r"arguments\s*=\s*\[(.*?)\]", block, re.DOTALL)
-            pairs = re.findall(r"[\"']([^\"']*)[\"']|([-+.\deE]+)", own[1]) if own else []
-            words.append([quoted or number for quoted, number in pairs])
-    for given in words:
-        named = {k.lstrip("-"): v for k, v in zip(given[::2], given[1::2], strict=False)}
-        try:
-            if "frame-id" in named:
-                ends = named["frame-id"], named["child-frame-id"]
+            given = shlex.split(text)
+            if "--frame-id" in given:
+                keys, given = [key.lstrip("-") for key in given[::2]], given[1::2]
             else:
-                is_number = re.fullmatch(r"[-+]?[\d.]+(e[-+]?\d+)?", given[6], re.IGNORECASE)
-                keys = [*"xyz", *(quaternion if is_number else ("yaw", "pitch", "roll"))]
-                named = dict(zip(keys, given, strict=False))
-                ends = given[len(keys)], given[len(keys) + 1]
-            turn = {key: float(named[key]) for key in quaternion if key in named}
-            rpy = [float(named.get(key, 0.0)) for key in ("roll", "pitch", "yaw")]
-            place = {key: float(named.get(key, 0.0)) for key in "xyz"}
+                turns = quaternion if _floats(given[6]) else ("yaw", "pitch", "roll")
+                keys = [*"xyz", *turns, "frame-id", "child-frame-id"]
+            named = dict(zip(keys, given, strict=False))
+            turns = quaternion if "qw" in named else ("roll", "pitch", "yaw")
+            moved = {key: float(named.get(key, 0.0)) for key in (*"xyz", *turns)}
+            ends = {"frame_id": named["frame-id"], "child_frame_id": named["child-frame-id"]}
         except (ValueError, LookupError):
             continue
-        moved = {"translation": place, **({"rotation": turn} if turn else {"rpy": rpy})}
-        frames = {"header": {"frame_id": ends[0]}, "child_frame_id": ends[1]}
-        found.append({**frames, "transform": moved})
-    return found
+        found.append({**ends, "transform": moved})
+    return transforms(content._replace(value=found)) if found else f"no {name}"
 
 
-def _is_transform(entry: Any) -> bool:
-    """Return whether an entry names its child frame, as TransformStamped does."""
-    return isinstance(entry, dict) and bool({"child_frame_id", "child_frame"} & {*entry})
+def transforms(content: Content) -> Parsed:
+    """Read TransformStamped messages: one, a list, `transforms`, or by any names.
 
-
-def _transforms(entries: Sequence[Any], path: Path) -> dict[str, RecordedPose]:
-    """Return the poses of the frames that no other one is attached to, by the frame's name."""
-    frames = dict[str, tuple[str, Array, str]]()
-    for k, entry in enumerate(entries):
-        if not isinstance(entry, dict):
-            return {}
-        one = _pose_of(entry, f"{path}: entry {k}")
-        if one is None:
-            continue
-        header = entry.get("header")
-        parent = header.get("frame_id", "") if isinstance(header, dict) else ""
-        parent = parent or entry.get("parent_frame") or entry.get("frame_id", "")
-        child = entry.get("child_frame_id") or entry.get("child_frame") or entry.get("name")
-        frames[str(child or f"{path.stem}_{k}")] = str(parent).lstrip("/"), one.X, one.assumed
-    inner = {parent for parent, *_ in frames.values()}
-    found = dict[str, RecordedPose]()
-    for name, (parent, X, assumed) in frames.items():
-        if name in inner:
-            continue
-        above = [name]
-        while parent in frames and parent not in above:
-            above.append(parent)
-            parent, X_PX, _ = frames[parent]
-            X = X_PX @ X
-        # A hand or tool, by its name; else the base.
-        hand = r"tool|flange|hand|gripper|effector|wrist|tcp|(^|_)ee(_|$)"
-        found[name] = _optical(
-            name, RecordedPose(X, parent if re.search(hand, parent, re.IGNORECASE) else "", assumed)
-        )
-    return found
-
-
-def _optical(frame: str, one: RecordedPose) -> RecordedPose:
-    """Return the pose of the optical frame, given that of a frame by its name.
-
-    REP 103 of ROS: the x axis of a camera's link points forward and z up; "optical" is in the name
-    of frames with z forward.
+    The cameras are the frames to which no other is attached.
     """
-    if not frame.endswith("_link"):
+    messages = content.mapping.get("transforms", content.value)
+    if isinstance(messages, dict):
+        messages = [messages, *messages.values()]
+    frames, poses = dict[str, tuple[str, Array]](), dict[str, Entry]()
+    for one in messages if isinstance(messages, list) else ():
+        child = one.get("child_frame_id", one.get("child_frame")) if isinstance(one, dict) else None
+        pose = None if child is None else pose_of(one, f"{content.path}: frame '{child}'")
+        if pose is not None and pose.X is not None:
+            header = one["header"] if isinstance(one.get("header"), dict) else one
+            parent = header.get("frame_id", one.get("parent_frame", ""))
+            frames[str(child)], poses[str(child)] = (str(parent).lstrip("/"), pose.X), pose
+    inner, found = {parent for parent, _ in frames.values()}, dict[str, Entry]()
+    for name in [name for name in frames if name not in inner]:
+        root, X = above(frames, name)
+        hand = re.search(
+            r"tool|flange|hand|gripper|effector|wrist|tcp|(^|_)ee(_|$)", root, re.IGNORECASE
+        )
+        pose = poses[name]._replace(X=X, link=root if hand else "")
+        found[name] = optical(name, pose, is_turned=name.endswith("_link"))
+    return found or "no child_frame_id"
+
+
+def above(frames: Mapping[str, tuple[str, Array]], name: str) -> tuple[str, Array]:
+    """Return the last frame above a frame, and the pose (4, 4) of the frame in it.
+
+    frames: parent and pose of each frame in it, by name.
+    """
+    (parent, X), seen = frames[name], {name}
+    while parent in frames and parent not in seen:
+        seen.add(parent)
+        parent, X_PF = frames[parent]
+        X = X_PF @ X
+    return parent, X
+
+
+def optical(frame: str, one: Entry, is_turned: bool) -> Entry:
+    """Return a camera at its optical frame, given the pose of a frame by its name.
+
+    is_turned: whether the frame is that of a link. REP 103 of ROS: its x axis points forward and z
+    up; "optical" is in the name of frames with z forward.
+    """
+    if not is_turned or one.X is None:
         return one
     X = one.X.copy()
     X[:3, :3] = X[:3, :3] @ np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -212,239 +284,165 @@ def _optical(frame: str, one: RecordedPose) -> RecordedPose:
         f"frame '{frame}' is read as ROS' link of a camera, x forward and z up; its lens may "
         "stand some millimetres beside it"
     )
-    return RecordedPose(X, one.link, "; ".join(filter(None, [one.assumed, text])))
+    return one._replace(X=X, assumed="; ".join(filter(None, [one.assumed, text])))
 
 
-def _poses_by_name(content: Mapping[Any, Any], path: Path) -> dict[str, RecordedPose]:
-    """Return the poses of a mapping from names to poses; other entries are left out."""
-    found = dict[str, RecordedPose]()
-    for key, value in content.items():
-        name = str(key)
-        if _is_transform(value):
-            found |= _transforms([value], path)
-        elif (one := _pose_of(value, f"{path}: camera '{name}'")) is not None:
-            found[name] = one
-    return found
+def urdf(content: Content) -> Parsed:
+    """Read the frames of a URDF model, on fixed joints, whose names say camera or optical.
 
-
-def _plain(key: Any) -> str:
-    """Return a key in lower case, without all but letters and digits."""
-    return re.sub(r"[^a-z0-9]", "", str(key).lower())
-
-
-def _looks_posed(value: Any) -> bool:
-    """Return whether a value is a pose, right or wrong."""
-    try:
-        return _pose_of(value, "") is not None
-    except CameraError:
-        return True
-
-
-def _numbers(value: Any, keys: Sequence[str] = ()) -> Array | None:
-    """Return the numbers (n,) of nested lists or of a mapping's keys; None: there are no such."""
-    if isinstance(value, dict):
-        plain = {_plain(key): one for key, one in value.items()}
-        value = [plain[key] for key in keys if key in plain]
-        if not keys or len(value) != len(keys):
-            return None
-    found = finite_numbers(value)
-    return found if found is not None and len(found) else None
-
-
-def finite_numbers(value: Any) -> Array | None:
-    """Return the finite numbers (n,), by rows, of an array or of small nested lists; or None."""
-    if not isinstance(value, list | tuple | np.ndarray) or not _is_small(value, 3):
-        return None
-    try:
-        found = np.asarray(value, dtype=np.float64).ravel()
-    except (ValueError, TypeError):
-        return None
-    return found if np.isfinite(found).all() else None
-
-
-def _is_small(value: Any, depth: int) -> bool:
-    """Return whether nested lists have few levels and entries; aliases of YAML may hold billions.
-
-    ``value``: the lists; anything else is small. ``depth``: maximum number of levels. A list may
-    have several times as many entries as a pose.
+    A frame may have the name of the recording's camera instead. A camera below a joint that moves
+    rides on that joint's link. Of several optical frames of one camera, that of its colours is
+    read.
     """
-    if not isinstance(value, list | tuple):
-        return True
-    return depth > 0 and len(value) <= 100 and all(_is_small(one, depth - 1) for one in value)
-
-
-def _pose_of(value: Any, where: str) -> RecordedPose | None:
-    """Return a pose in any of the forms of this module; None: it is none.
-
-    where: start of error messages. Raises CameraError: a rotation is none.
-    """
-    if not isinstance(value, dict):
-        numbers = _numbers(value)
-        if numbers is None or numbers.size not in (6, 7, 12, 16):
-            return None
-        if numbers.size in (12, 16):
-            matrix = np.eye(4)
-            matrix[: numbers.size // 4] = numbers.reshape(-1, 4)
-            if abs(matrix[3] - [0.0, 0.0, 0.0, 1.0]).max() > 1e-6:
-                return None
-            return _rigid(matrix[:3, :3], matrix[:3, 3], where)
-        if numbers.size == 7:
-            R, assumed = _quaternion(numbers[3:], "", where)
+    robot = content.root("robot")
+    if robot is None:
+        return "no <robot>"
+    frames, moving = dict[str, tuple[str, Array]](), set[str]()
+    for joint in robot.findall("joint"):
+        parts = {one.tag: one.attrib for one in joint}
+        parent, child = (parts.get(end, {}).get("link", "") for end in ("parent", "child"))
+        xyz, rpy = (_floats(parts.get("origin", {}).get(k, "0 0 0")) for k in ("xyz", "rpy"))
+        if not len(xyz) == len(rpy) == 3:
+            raise CameraError(
+                f"{content.path}: joint '{joint.get('name')}' has an origin that is no numbers: "
+                "expand a xacro file first (xacro FILE > arm.urdf)"
+            )
+        if joint.get("type") == "fixed":
+            X_PC = np.eye(4)
+            X_PC[:3, :3], X_PC[:3, 3] = Rotation.from_euler("xyz", rpy).as_matrix(), xyz
+            frames[child] = parent, X_PC
         else:
-            R, unit = _euler(numbers[3:], "")
-            assumed = f"its six numbers are read as x, y, z [m], roll, pitch, yaw [{unit}]"
-        return _rigid(R, numbers[:3], where)._replace(assumed=assumed)
-    keys = {_plain(key): one for key, one in value.items()}
-    if (found := _moved_and_turned(keys, where)) is not None:
-        return found
-    for key, one in keys.items():
-        is_inverse = _is_inverse(key)
-        inner = None if is_inverse is None else _pose_of(one, where)
-        if inner is None:
-            continue
-        return inner._replace(X=inverse_pose(inner.X)) if is_inverse else inner
-    return None
-
-
-def _is_inverse(key: str) -> bool | None:
-    """Return whether a plain key names the pose of the world in the camera.
-
-    False: it names the pose of the camera in the world; None: no pose. T_base_cam and cam_to_base
-    are the camera's pose in the base, T_cam_base and base_to_cam the inverse.
-    """
-    base, camera, end = "(world|base|robot)", "cam(era)?", "(transform|matrix|pose)?$"
-    inverse = f"cw|w2c|{base}(to|2){camera}|{camera}t?{base}|viewmatrix|extrinsiccv"
-    pose = f"wc|c2w|{camera}(to|2){base}|{base}t?{camera}|({camera})?(pose|extrinsics?)"
-    if re.match(f"^[txh]?({inverse}){end}", key):
-        return True
-    plain = "transform|transformation|matrix|calibration"
-    return False if re.match(f"^([txh]?({pose}){end}|({plain})$)", key) else None
-
-
-def _moved_and_turned(keys: Mapping[str, Any], where: str) -> RecordedPose | None:
-    """Return the pose of a mapping, by plain keys, with a translation and a rotation; or None."""
-    moves = ("translation", "position", "pos", "trans", "xyz", "tvec", "t", "p", "location")
-    translation = _numbers(dict(keys), ("x", "y", "z"))
-    for key in moves:
-        if key in keys and translation is None:
-            translation = _numbers(keys[key], ("x", "y", "z"))
-    if translation is None or translation.size != 3:
-        return None
-    for key in ("qx", "roll", "rotation", "rotationmatrix", "r", "rot", "mat", "orientation",
-                "rvec", "rotvec", "rotationvector", "rpy", "euler", "eulerangles", "eulerdeg",
-                "rpydeg", "q", "quat", "quaternion", "quatwxyz", "quaternionwxyz", "quatxyzw",
-                "quaternionxyzw"):  # fmt: skip
-        if key in keys:
-            value = dict(keys) if key in ("qx", "roll") else keys[key]
-            turned = _rotation(key, value, where)
-            if turned is not None:
-                return _rigid(turned[0], translation, where)._replace(assumed=turned[1])
-    return None
-
-
-def _rotation(key: str, value: Any, where: str) -> tuple[Array, str] | None:
-    """Return the rotation (3, 3) under a plain key, and what was assumed about it; None: none."""
-    for names in (("qx", "qy", "qz", "qw"), ("x", "y", "z", "w")):
-        if isinstance(value, dict) and (numbers := _numbers(value, names)) is not None:
-            return _quaternion(numbers, "xyzw", where)
-    if (
-        isinstance(value, dict)
-        and (numbers := _numbers(value, ("roll", "pitch", "yaw"))) is not None
+            moving.add(child)
+    words = re.compile("camera|optical|(^|_)cam(_|$)", re.IGNORECASE)
+    named = [name for name in frames if words.search(name) or name in content.sizes]
+    inner = {frames[name][0] for name in named}
+    seen = [name for name in named if "optical" in name or not words.search(name)]
+    found = dict[str, Entry]()
+    for name in sorted(
+        seen or [name for name in named if name not in inner],
+        key=lambda name: ("color" in name or "rgb" in name, "optical" in name),
+        reverse=True,
     ):
-        return _euler(numbers, key)[0], ""
-    numbers = _numbers(value)
-    if numbers is None:
-        return None
-    if numbers.size == 9:
-        return numbers.reshape(3, 3), ""
-    if numbers.size == 4:
-        order = "wxyz" if key.endswith("wxyz") else "xyzw" if key.endswith("xyzw") else ""
-        return _quaternion(numbers, order, where)
-    if numbers.size != 3:
-        return None
-    if key.startswith(("rpy", "euler")):
-        R, unit = _euler(numbers, key)
-        return R, f"its angles are read as roll, pitch, yaw [{unit}]"
-    if np.abs(numbers).max() > 2.0 * math.pi:
-        return _euler(numbers, key)[0], "its rotation is read as roll, pitch, yaw [deg]"
-    R = Rotation.from_rotvec(numbers).as_matrix()
-    is_said = key in ("rvec", "rotvec", "rotationvector")
-    return R, "" if is_said else "its rotation is read as a rotation vector [rad]"
+        if short_name(name) not in map(short_name, found):
+            root, X = above(frames, name)
+            text = f"link '{name}' is read as the frame of the lens, x right, y down, z forward"
+            entry = Entry(X, root if root in moving else "", "" if words.search(name) else text)
+            is_turned = "optical" not in name and words.search(name) is not None
+            found[name] = optical(name, entry, is_turned=is_turned)
+    return found or "no camera or optical in the name of a link on a fixed joint"
 
 
-def _quaternion(numbers: Array, order: str, where: str) -> tuple[Array, str]:
-    """Return the rotation (3, 3) of a quaternion (4,), and what was assumed about its order.
+def _floats(text: str) -> list[float]:
+    """Return the numbers of a text, between spaces or commas; empty if they are none."""
+    try:
+        return [float(one) for one in text.replace(",", " ").split()]
+    except ValueError:
+        return []
 
-    order: "xyzw" or "wxyz"; "": unknown, read as xyzw, ROS' order.
+
+def mujoco(content: Content) -> Parsed:
+    """Read the ``<camera>`` elements of a model of MuJoCo, or of a file to be included in one.
+
+    A camera inside a body is on the link of that name, unless the model holds the body still. Its
+    intrinsics are ``resolution`` with ``focalpixel`` and ``principalpixel``, or with ``fovy``.
     """
-    length = float(np.linalg.norm(numbers))
-    if abs(length - 1.0) > 0.02:
-        raise CameraError(f"{where}: its quaternion has the length {length:.3g}, not 1")
-    turn = np.roll(numbers, -1) if order == "wxyz" else numbers
-    R = np.asarray(Rotation.from_quat(turn).as_matrix())
-    return R, "" if order else "its quaternion is read as x, y, z, w"
+    found = dict[str, Entry]()
+
+    def read(body: ElementTree.Element, X_WB: Array, link: str) -> None:
+        for one in body:
+            name = one.get("name", f"{content.path.stem}_{len(found)}")
+            if one.tag == "camera":
+                found[name] = _mujoco_camera(name, one, X_WB, link, str(content.path))
+            elif one.tag == "body":
+                is_free = is_part or any(part.tag in ("joint", "freejoint") for part in one)
+                pose = _mujoco_pose(one, f"{content.path}: body '{name}'")
+                read(one, np.eye(4) if is_free else X_WB @ pose, name if is_free else link)
+            elif one.tag in ("worldbody", "frame"):
+                read(one, X_WB @ _mujoco_pose(one, str(content.path)), link)
+
+    root = content.root("mujoco", "mujocoinclude")
+    if root is not None:
+        is_part = root.tag == "mujocoinclude"
+        read(root, np.eye(4), "")
+    return found or "no <camera>"
 
 
-def _euler(angles: Array, key: str) -> tuple[Array, str]:
-    """Return the rotation (3, 3) of roll, pitch and yaw about fixed axes, and their unit.
+def _mujoco_pose(one: ElementTree.Element, where: str) -> Array:
+    """Return the pose (4, 4) of an element of MuJoCo in its parent."""
+    if {"euler", "axisangle", "zaxis"} & {*one.attrib}:
+        raise CameraError(f"{where}: its rotation must be quat or xyaxes")
+    turn = {"quat_wxyz": _floats(one.get("quat", "1 0 0 0"))}
+    if len(axes := _floats(one.get("xyaxes", ""))) == 6:
+        x, y = (axis / np.linalg.norm(axis) for axis in np.reshape(axes, (2, 3)))
+        turn = {"rotation": np.column_stack([x, y, np.cross(x, y)]).tolist()}
+    found = pose_of({"pos": _floats(one.get("pos", "0 0 0")), **turn}, where)
+    if found is None or found.X is None:
+        raise CameraError(f"{where}: pos must be three numbers, quat four, xyaxes six")
+    return found.X
 
-    The unit is "deg" if the key says so or an angle is more than a turn in radians, else "rad".
+
+def _mujoco_camera(name: str, one: ElementTree.Element, X_WB: Array, link: str, path: str) -> Entry:
+    """Return a camera of MuJoCo in a body whose pose in the world, or link, is X_WB (4, 4)."""
+    X = X_WB @ _mujoco_pose(one, f"{path}: camera '{name}'") @ np.diag([1.0, -1.0, -1.0, 1.0])
+    size = [int(side) for side in _floats(one.get("resolution", ""))]
+    focal, shift = _floats(one.get("focalpixel", "")), _floats(one.get("principalpixel", "0 0"))
+    for fovy in [] if focal else _floats(one.get("fovy", "")):
+        focal = [0.5 * size[-1] / math.tan(0.5 * math.radians(fovy))] * 2 if size else []
+    if not len(size) == len(focal) == len(shift) == 2:
+        return Entry(X, link)
+    centre = (0.5 * (np.array(size) - 1.0) - shift).tolist()
+    camera = PinholeCamera(name, size[0], size[1], focal[0], focal[1], centre[0], centre[1], X)
+    return Entry(X, link, camera=camera)
+
+
+def tf2_echo(content: Content) -> Parsed:
+    """Read what ``tf2_echo BASE CAMERA`` prints: `Translation` and `in Quaternion`, repeatedly."""
+    number = r"[^\[\n]*\[([^\]]*)\]"
+    moves = re.findall(f"Translation:{number}", content.text)
+    turns = re.findall(f"in Quaternion{number}", content.text)
+    if not moves or len(moves) != len(turns):
+        return "no Translation"
+    text = "is read as the camera's pose in the base, as tf2_echo BASE CAMERA prints it"
+    poses = [
+        pose_of([*_floats(place), *_floats(turn)], str(content.path))
+        for place, turn in zip(moves, turns, strict=True)
+    ]
+    return standing([one for one in poses if one is not None], content.path, text)
+
+
+def standing(poses: Sequence[Entry], path: Path, assumed: str = "") -> Parsed:
+    """Return the one camera of poses without a name, such as one for each frame.
+
+    path: the file, whose name is the camera's. Raises CameraError: the poses differ by more than
+    their rounding.
     """
-    in_degrees = "deg" in key or float(np.abs(angles).max()) > 2.0 * math.pi
-    R = Rotation.from_euler("xyz", angles, degrees=in_degrees).as_matrix()
-    return np.asarray(R), "deg" if in_degrees else "rad"
+    matrices = np.array([one.X for one in poses if one.X is not None])
+    spread = float(np.ptp(matrices, axis=0).max()) if len(matrices) else 0.0
+    if spread > 0.1 * ROUNDED:
+        raise CameraError(
+            f"{path}: has {len(matrices)} poses without the names of cameras, which differ by up "
+            f"to {spread:.3g}: give one pose, or each below its camera's name (NAME: POSE); a "
+            "camera that rides on a link has one pose there (link, X_LC)"
+        )
+    if not len(matrices):
+        return "no pose"
+    return {path.stem: poses[-1]._replace(assumed=assumed or poses[-1].assumed)}
 
 
-def _rigid(R: Array, translation: Array, where: str, most: float = 0.01) -> RecordedPose:
-    """Return the pose of a rotation (3, 3) and a translation (3,) [m].
-
-    A rotation with R R^T within `most` of the identity is rounded, and is replaced by the nearest
-    exact one. Raises CameraError: it is not a rotation.
-    """
-    X = np.eye(4)
-    X[:3, :3], X[:3, 3] = R, translation
-    if np.abs(R @ R.T - np.eye(3)).max() < most:
-        U, _, Vt = np.linalg.svd(R)
-        X[:3, :3] = U @ Vt
-    return RecordedPose(np.array(check_pose(X, "pose", where)))
-
-
-def recording_names(recording: Path | None) -> tuple[frozenset[str], dict[str, str]]:
-    """Return an episode's names in files of many, and its cameras' serial numbers by DROID's role.
-
-    Both are those of `metadata_<episode ID>.json` in a raw folder of DROID, with the folder's own
-    names; the roles are ext1, ext2 and wrist.
-
-    recording: the recording's folder or file; None: unknown.
-    """
-    if recording is None:
-        return frozenset(), {}
-    folder = recording if recording.is_dir() else recording.parent
-    ids, serials = {recording.name, recording.stem, folder.name}, dict[str, str]()
-    for file in sorted(folder.glob("metadata_*.json")):
-        ids.add(file.stem.removeprefix("metadata_"))
-        try:
-            content = json.loads(read_regular(file, 1 << 20))
-        except (OSError, ValueError):
-            continue
-        if isinstance(content, dict):
-            ids |= {str(content[key]) for key in ("uuid", "relative_path") if key in content}
-            for role in ("ext1", "ext2", "wrist"):
-                if (serial := content.get(f"{role}_cam_serial")) is not None:
-                    serials[role] = str(serial)
-    return frozenset(ids), serials
+def short_name(frame: str) -> str:
+    """Return a frame's name without ends such as ``_color_optical_frame``, ROS' of one camera."""
+    ends = r"(_(color|rgb|depth|infra\d?|left|right))?(_optical)?(_frame|_link|_base)$"
+    return re.sub(ends, "", frame)
 
 
 def same_camera(pose: str, known: Sequence[str]) -> str | None:
     """Return the known camera that a pose's name means; None: none, or several.
 
-    ``<serial>_left`` is DROID's left lens of ``<serial>``; ends such as ``_color_optical_frame``
-    are ROS' frames of one camera.
+    ``<serial>_left`` is DROID's left lens of ``<serial>``.
     """
     for name in (pose, f"{pose}_left", pose.removesuffix("_left")):
         if name in known:
             return name
-    ends = r"(_(color|rgb|depth|infra\d?|left|right))?(_optical)?(_frame|_link|_base)$"
-    short = re.sub(ends, "", pose)
-    alike = [one for one in known if short and _plain(re.sub(ends, "", one)) == _plain(short)]
+    short = plain_key(short_name(pose))
+    alike = [one for one in known if short and plain_key(short_name(one)) == short]
     return alike[0] if len(alike) == 1 else None

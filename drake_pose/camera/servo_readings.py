@@ -15,7 +15,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal, NamedTuple, cast
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -25,6 +25,9 @@ from drake_pose.input_files import read_regular
 
 Encoding = Literal["rad", "deg", "normalised", "steps"]
 """What readings are: angles, LeRobot's -100 ... 100 (a gripper's 0 ... 100), or encoder steps."""
+
+UNITS = {"rad": 1.0, "deg": math.pi / 180.0}
+"""Units of angles [rad]."""
 
 
 class Motor(NamedTuple):
@@ -92,28 +95,27 @@ def read_motors(path: Path, robot: str = "", largest: int = 1 << 20) -> Servos |
         return None
     try:
         if has_lists:
-            names, homing, modes = (list(content[key]) for key in lists)
-            none = [math.nan] * len(names)
-            ends = [content.get(key) or none for key in ("start_pos", "end_pos")]
-            kinds = content.get("calib_mode") or none
-            rows = zip(names, homing, modes, kinds, *ends, strict=True)
-            for name, home, mode, kind, *own in rows:
-                low, high = own if kind == "LINEAR" else (math.nan, math.nan)
-                found[str(name)] = Motor(float(low), float(high), int(home), bool(mode))
-            return Servos(robot, path, found, has_lists)
-        for name, one in content.items():
-            low, high = float(one["range_min"]), float(one["range_max"])
-            mode = bool(one.get("drive_mode", 0))
-            found[str(name)] = Motor(low, high, int(one["homing_offset"]), mode)
+            none = [math.nan] * len(content["motor_names"])
+            kinds = (content.get(key) or none for key in ("calib_mode", "start_pos", "end_pos"))
+            rows = [*zip(*(content[key] for key in lists), *kinds, strict=True)]
+        else:
+            rows = [
+                (name, one["homing_offset"], one.get("drive_mode", 0), "LINEAR", *ends)
+                for name, one in content.items()
+                for ends in [(one["range_min"], one["range_max"])]
+            ]
+        for name, home, mode, kind, *own in rows:
+            low, high = own if kind == "LINEAR" else (math.nan, math.nan)
+            found[str(name)] = Motor(float(low), float(high), int(home), bool(mode))
     except (TypeError, ValueError) as error:
         raise SceneError(f"{path}: a calibration of motors is damaged: {error}") from error
     for name, one in found.items():
-        if not one.low < one.high:
+        if not (has_lists or one.low < one.high):
             raise SceneError(
                 f"{path}: motor '{name}': range_min {one.low:g} must be less than range_max "
                 f"{one.high:g}: calibrate the robot again (lerobot-calibrate)"
             )
-    return Servos(robot, path, found)
+    return Servos(robot, path, found, has_lists)
 
 
 def find_motors(folder: Path, robot: str, columns: Iterable[str]) -> tuple[Servos, list[str]]:
@@ -174,137 +176,36 @@ class Column(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class ServoJoint:
-    """A joint whose column holds the readings of a servo."""
+class JointReadings:
+    """A joint and the readings of its column."""
 
     name: str  # Name of the joint.
     column: str  # Name of the column.
-    # (n,) readings [degrees, radians, LeRobot's -100 ... 100, or steps]; nan: missing.
-    readings: Array
+    readings: Array  # (n,) readings in the log's unit; nan: missing.
     # lower, upper: limits of the joint, infinite if there are none [rad or m].
     lower: float
     upper: float
     is_angle: bool  # Whether the joint is revolute.
     is_gripper: bool  # Whether the joint opens a gripper.
-    motor: Motor | None  # The motor's calibration; None: unknown.
+    motor: Motor | None = None  # The motor's calibration; None: unknown.
 
     def is_called(self, names: tuple[str, ...]) -> bool:
         """Return whether the column's or the joint's name ends with one of the names."""
         return self.column.removesuffix(".pos").endswith(names) or self.name.endswith(names)
 
+    @property
+    def ends(self) -> tuple[float, float]:
+        """The smallest and the largest reading; 0 and 0 without readings."""
+        known = self.readings[np.isfinite(self.readings)]
+        return (float(known.min()), float(known.max())) if known.size else (0.0, 0.0)
 
-def servo_encoding(
-    joints: Sequence[ServoJoint], servos: Servos | None, units: str | None, slack: float
-) -> tuple[Encoding | None, list[str]]:
-    """Return the encoding of columns that LeRobot recorded from servos, and warnings.
-
-    None: the columns are radians or degrees that follow the model, or lengths.
-
-    Args:
-        joints: joints with their columns and motors.
-        servos: the robot's motors; None: LeRobot did not record the log.
-        units: the encoding as the user says; None: it is inferred.
-        slack: tolerance of the limits [rad].
-
-    Raises SceneError: the readings seem to be normalised, and their ranges are not known.
-    """
-    known, is_named = servos or Servos(), any(joint.column.endswith(".pos") for joint in joints)
-    is_arm = known.is_so or known.is_dynamixel or any(joint.motor is not None for joint in joints)
-    bodies = [joint for joint in joints if joint.is_angle and not joint.is_gripper]
-    is_radians, is_degrees = (
-        all(
-            np.nanmin(scale * joint.readings, initial=np.inf) >= joint.lower - slack
-            and np.nanmax(scale * joint.readings, initial=-np.inf) <= joint.upper + slack
-            for joint in bodies
-        )
-        for scale in (1.0, math.radians(1.0))
-    )
-    is_plain = is_radians if servos is not None else not is_arm
-    if units == "rad" or not bodies or (is_plain and not is_named and not units):
-        return None, []
-    encoding, why = (units, "") if units else (_find_encoding(joints, known.turn) or (None, ""))
-    is_told = {
-        "deg": is_arm or (is_named and is_degrees),
-        "normalised": is_arm or is_named or units is not None,
-        "steps": servos is not None or units is not None,
-    }
-    if encoding is None or not is_told[encoding]:
-        return None, []
-    if encoding == "normalised" and not units:
-        unknown = [joint.column for joint in bodies if range_in_steps(joint, known.turn) is None]
-        if unknown and not (known.is_so or known.is_dynamixel):
-            raise SceneError(
-                f"the readings of the joint log ({', '.join(unknown)}) seem to be normalised to "
-                "-100 ... 100, as in LeRobot, and their ranges are not known: put the robot's "
-                "calibration file into the data set or name it (--joint-map FILE), or give units: "
-                "rad, deg, or normalised for the joints' limits, or a joint map with the range of "
-                "each: JOINT: {column: COLUMN, from: [-100, 100], to: [LOWEST, HIGHEST]} in radians"
-            )
-        if is_radians and why.startswith("but"):
-            raise SceneError(
-                f"the readings of the joint log ({', '.join(one.column for one in bodies)}) could "
-                "be radians, degrees, or normalised to -100 ... 100: give units: rad, deg or "
-                "normalised"
-            )
-    source = "no calibration file of the robot is in or beside the data set"
-    source += f", so {known.turn // 2} is taken for zero" if encoding == "steps" else ""
-    source = f"their ranges are those of {known.path}" if known.path else source
-    what = {
-        "normalised": "LeRobot's -100 ... 100 of the motors' ranges",
-        "deg": "LeRobot's degrees",
-        "steps": f"encoder steps, {known.turn} a turn",
-    }[str(encoding)]
-    texts = [
-        f"readings of the joint log are taken to be {what}{': ' if why else ''}{why}; {source}; "
-        "zeros set by hand are off by several degrees: estimate them (--zeros all)"
-    ]
-    return cast(Encoding, encoding), texts
+    def excess(self, scale: float, most: float = np.inf) -> float:
+        """Return by how much readings times a scale exceed the limits, or plus and minus most."""
+        (low, high), least, last = self.ends, max(self.lower, -most), min(self.upper, most)
+        return float(max(least - scale * low, scale * high - last))
 
 
-def _find_encoding(
-    joints: Sequence[ServoJoint], turn: int, full: float = 100.001, most: float = 720.0
-) -> tuple[Encoding, str] | None:
-    """Infer the encoding of servos' readings; return it, and the reason for messages, or None.
-
-    Encoders count in whole steps: an encoding is right if readings are whole steps in it alone.
-    None: there are no readings, or they are too large for steps.
-
-    ``joints``: the joints; a gripper's readings are not regarded. ``turn``: steps of a full turn.
-    ``full``: maximum magnitude of normalised readings, with the rounding of stored numbers.
-    ``most``: maximum magnitude of degrees, two turns [deg]; larger readings are steps.
-    """
-    body = [joint for joint in joints if joint.is_angle and not joint.is_gripper]
-    known_readings = [(joint, joint.readings[np.isfinite(joint.readings)]) for joint in body]
-    known = [replace(joint, readings=own) for joint, own in known_readings if own.size]
-    if not known:
-        return None
-    largest = max(float(np.nanmax(np.abs(joint.readings))) for joint in known)
-    if largest > most:
-        # Only homed motors count below 0, or beyond a turn.
-        low, high = (-turn, 2 * turn) if all(joint.motor for joint in known) else (0, turn)
-        is_count = all(((one.readings >= low) & (one.readings <= high)).all() for one in known)
-        return ("steps", f"they are up to {largest:.0f}") if is_count else None
-    # The middle of a range may be half a step.
-    degrees = _are_whole([2.0 * (turn - 1) / 360.0 * joint.readings for joint in known])
-    if largest > full:
-        return "deg", f"the largest is {largest:.4g}, not within -100 ... 100"
-    counts = [(joint, range_in_steps(joint, turn)) for joint in known]
-    normalised = _are_whole([(joint.readings + 100.0) * n / 200.0 for joint, n in counts if n])
-    if degrees:
-        return "deg", "only as degrees they are whole steps of an encoder"
-    if normalised:
-        return "normalised", "only as -100 ... 100 of its range they are whole steps of an encoder"
-    for joint in known:
-        if joint.motor is not None and math.isfinite(joint.motor.high):
-            half = 180.0 * (joint.motor.high - joint.motor.low) / turn
-            if np.nanmax(np.abs(joint.readings)) > half + 2.0:
-                return "normalised", f"as degrees '{joint.column}' would leave its range"
-    if any((np.abs(joint.readings) == 100.0).any() for joint in known):
-        return "normalised", "some are -100 or 100 exactly"
-    return "normalised", "but they could be degrees, too"
-
-
-def _are_whole(columns: Sequence[Array], near: float = 0.03, least: int = 8) -> bool | None:
+def are_whole(columns: Sequence[Array], near: float = 0.03, least: int = 8) -> bool | None:
     """Return whether the numbers of all columns are whole; None: there are too few to tell.
 
     ``columns``: numbers (n,) of each column; nan: missing. ``near``: tolerance; numbers stored in
@@ -317,7 +218,7 @@ def _are_whole(columns: Sequence[Array], near: float = 0.03, least: int = 8) -> 
 
 
 def range_in_steps(
-    joint: ServoJoint, turn: int, least: int = 300, different: int = 24
+    joint: JointReadings, turn: int, least: int = 300, different: int = 24
 ) -> int | None:
     """Return the length of a motor's range [steps], from calibration or normalised readings.
 
@@ -335,12 +236,12 @@ def range_in_steps(
         return round(length) if math.isfinite(length) else None
     full = 100.0 if joint.is_gripper else 200.0
     shifted = np.unique(joint.readings[np.isfinite(joint.readings)]) + (full - 100.0)
-    found = (n for n in range(least, turn) if _are_whole([shifted * n / full], least=different))
+    found = (n for n in range(least, turn) if are_whole([shifted * n / full], least=different))
     return next(found, None)
 
 
-def servo_columns(
-    joints: Sequence[ServoJoint], servos: Servos, encoding: Encoding
+def unit_columns(
+    joints: Sequence[JointReadings], servos: Servos | None, unit: Encoding, slack: float
 ) -> tuple[dict[str, Column], list[str]]:
     """Return by joint name the linear map from its column, and warnings.
 
@@ -349,46 +250,49 @@ def servo_columns(
     LeRobot. The low end of a gripper's range is its joint's lower limit. Steps without a range have
     their zero at half a turn. A joint whose position does not follow has no map.
 
-    ``joints``: the joints, each with a column. ``servos``: the robot's motors. ``encoding``: of the
-    readings.
+    ``joints``: the joints, each with a column. ``servos``: the robot's motors; None: LeRobot did
+    not record the log. ``unit``: of the angles. ``slack``: tolerance of the limits, the smaller of
+    this [rad or m] and this fraction of their range.
     """
     columns, warnings, assumed = dict[str, Column](), list[str](), list[str]()
-    inner = {joint.name: _as_counted(joint, servos, encoding) for joint in joints}
-    is_degrees = {
-        joint.name: encoding == "deg" or (servos.has_lists and joint.motor is not None)
-        for joint in joints
-    }
+    known, is_servo = servos or Servos(), is_of_servos(joints, servos, unit)
+    inner = {joint.name: _as_counted(joint, known, unit) for joint in joints}
     shown = [
         replace(joint, readings=inner[joint.name].scale * joint.readings + inner[joint.name].offset)
         for joint in joints
-        if is_degrees[joint.name]
+        if is_servo and (unit == "deg" or (known.has_lists and joint.motor is not None))
     ]
-    degrees = _so_degrees(shown, servos)
+    degrees, is_shown = _so_degrees(shown, known), {joint.name for joint in shown}
     for joint in joints:
-        if joint.is_gripper:
-            column = _gripper_column(joint, servos, encoding)
+        plain = Column(joint.column, UNITS.get(unit, 1.0) if joint.is_angle else 1.0)
+        column: Column | None = plain
+        if joint.is_gripper and is_servo:
+            column = _gripper_column(joint, known, unit)
             if column is None:
                 warnings.append(
                     f"joint '{joint.name}': column '{joint.column}' does not tell its position, as "
                     "the gripper's range is not known; if it must be known, give a joint map"
                 )
-        elif is_degrees[joint.name]:
-            scale, offset = inner[joint.name][1:3]
-            outer = degrees.get(joint.name) or _plain_column(joint, servos, "deg")
+        elif joint.is_gripper or not joint.is_angle:
+            column, texts = _opening_column(joint, plain, servos is not None, slack)
+            warnings += texts
+        elif joint.name in is_shown:
+            _, scale, offset, _ = inner[joint.name]
+            outer = degrees.get(joint.name) or _plain_column(joint, known, "deg")
             column = Column(joint.column, outer.scale * scale, outer.scale * offset + outer.offset)
-        elif encoding == "steps":
-            column = _plain_column(joint, servos, encoding)
-        else:
-            length = range_in_steps(joint, servos.turn)
-            if length is None and joint.is_called(servos.full_turns):
-                length = servos.turn - 1
+        elif unit == "steps":
+            column = _plain_column(joint, known, unit)
+        elif unit == "normalised":
+            length = range_in_steps(joint, known.turn)
+            if length is None and joint.is_called(known.full_turns):
+                length = known.turn - 1
             if length is None:
                 assumed.append(joint.name)
                 column = _between(joint, -100.0, 100.0)
             else:
-                half = math.pi * length / servos.turn
-                ends = None if length >= servos.turn - 1 else (-100.0, 100.0)
-                column = Column(joint.column, 0.01 * half, _zero(joint, length, servos.turn), ends)
+                half = math.pi * length / known.turn
+                ends = None if length >= known.turn - 1 else (-100.0, 100.0)
+                column = Column(joint.column, 0.01 * half, _zero(joint, length, known.turn), ends)
         if column is not None:
             columns[joint.name] = column
     if degrees:
@@ -404,7 +308,59 @@ def servo_columns(
     return columns, warnings
 
 
-def _spans_limits(joint: ServoJoint, length: float, turn: int, alike: float = 0.25) -> bool:
+def is_of_arm(joints: Iterable[JointReadings], servos: Servos) -> bool:
+    """Return whether joints are moved by motors that LeRobot calibrates."""
+    return servos.is_so or servos.is_dynamixel or any(joint.motor for joint in joints)
+
+
+def is_of_servos(joints: Sequence[JointReadings], servos: Servos | None, unit: Encoding) -> bool:
+    """Return whether readings in a unit are those of LeRobot's motors, and not the model's."""
+    is_named = any(joint.column.endswith(".pos") for joint in joints)
+    is_hinted = is_named or is_of_arm(joints, servos or Servos())
+    return unit in ("normalised", "steps") or (unit == "deg" and is_hinted)
+
+
+def _opening_column(
+    joint: JointReadings,
+    plain: Column,
+    is_lerobot: bool,
+    slack: float,
+    millimetres_from: float = 20.0,
+) -> tuple[Column | None, list[str]]:
+    """Return the map of a length or of a gripper beside radians or degrees, and warnings.
+
+    Readings that are not within the limits may be millimetres, or a gripper's opening: LeRobot's 0
+    to 100 of its limits, or another one, which tells no position. A column that is not called a
+    gripper is no angle of one if it may be an opening, 0 to 1.
+
+    ``plain``: the map of angles and metres. ``millimetres_from``: multiple of its limits beyond
+    which a length may be in millimetres.
+    """
+    (low, high), span = joint.ends, joint.upper - joint.lower
+    room, size = min(slack, slack * span), max(abs(joint.lower), abs(joint.upper))
+    what = f"column '{joint.column}' of the joint log, {low:.3g} to {high:.3g},"
+    is_named = joint.column == joint.name or is_gripper_name(joint.column)
+    is_opening = joint.is_gripper and is_share(joint.readings)
+    excess = joint.excess(plain.scale)
+    if excess <= room and (is_named or not is_opening or not joint.is_angle):
+        return plain, []
+    if joint.is_gripper and is_lerobot and not is_opening and is_share(joint.readings, 100.0):
+        text = f"{what} is taken for LeRobot's opening, 0 to 100 of the joint's limits"
+        return _between(joint, 0.0, 100.0), [f"{text}; give a joint map if it is another"]
+    is_large = not joint.is_angle and max(-low, high) > millimetres_from * size
+    if is_large and joint.excess(1e-3) <= room:
+        text = f"{what} is assumed to be in mm: only so it is within the joint's limits"
+        return plain._replace(scale=1e-3), [f"{text}; if it is not, give a joint map"]
+    if joint.is_gripper and (is_opening or not is_named or excess > room + span):
+        return None, [
+            f"{what} is not taken for joint '{joint.name}' ({joint.lower:.3g} to "
+            f"{joint.upper:.3g}): it seems to be a gripper's opening; map it if it is known "
+            f"({joint.name}: {{column: {joint.column}, from: [0, 1], to: [OPEN, CLOSED]}})"
+        ]
+    return plain, []
+
+
+def _spans_limits(joint: JointReadings, length: float, turn: int, alike: float = 0.25) -> bool:
     """Return whether the range of a joint's motor is about as long as the joint's limits.
 
     ``length``: of the range [steps]. ``turn``: steps of a full turn. ``alike``: maximum difference
@@ -414,7 +370,7 @@ def _spans_limits(joint: ServoJoint, length: float, turn: int, alike: float = 0.
     return abs(2.0 * math.pi * length / turn - span) <= alike * span < math.inf
 
 
-def _zero(joint: ServoJoint, length: float, turn: int) -> float:
+def _zero(joint: JointReadings, length: float, turn: int) -> float:
     """Return a joint's position [rad] in the middle of its motor's range, of a ``length`` [steps].
 
     It is 0 if the range tells nothing of the joint's limits.
@@ -423,7 +379,7 @@ def _zero(joint: ServoJoint, length: float, turn: int) -> float:
     return 0.5 * (joint.lower + joint.upper) if told else 0.0
 
 
-def _between(joint: ServoJoint, low: float, high: float) -> Column | None:
+def _between(joint: JointReadings, low: float, high: float) -> Column | None:
     """Return the map that takes readings low and high to the joint's limits; None: no limits."""
     span = joint.upper - joint.lower
     if not math.isfinite(span):
@@ -433,7 +389,7 @@ def _between(joint: ServoJoint, low: float, high: float) -> Column | None:
     return Column(joint.column, scale, joint.lower - scale * low, ends)
 
 
-def _as_counted(joint: ServoJoint, servos: Servos, encoding: Encoding) -> Column:
+def _as_counted(joint: JointReadings, servos: Servos, encoding: Encoding) -> Column:
     """Return the map from a joint's steps to degrees, if its motor is calibrated by lists.
 
     Lists, the calibration of LeRobot before June 2025, home and invert what the motor counts. All
@@ -446,7 +402,7 @@ def _as_counted(joint: ServoJoint, servos: Servos, encoding: Encoding) -> Column
     return Column(joint.column, sign * scale, scale * joint.motor.homing)
 
 
-def _plain_column(joint: ServoJoint, servos: Servos, encoding: Encoding) -> Column:
+def _plain_column(joint: JointReadings, servos: Servos, encoding: Encoding) -> Column:
     """Return a joint's map from encoder steps, or from degrees of which LeRobot counts 360 to 4095.
 
     Without a calibration the zero of steps is half a turn.
@@ -462,7 +418,7 @@ def _plain_column(joint: ServoJoint, servos: Servos, encoding: Encoding) -> Colu
     return Column(joint.column, step, zero - step * (0.5 * (motor.low + motor.high)))
 
 
-def _so_degrees(joints: Sequence[ServoJoint], servos: Servos) -> dict[str, Column]:
+def _so_degrees(joints: Sequence[JointReadings], servos: Servos) -> dict[str, Column]:
     """Return the maps of SO arms' joints whose zero and sign changed in LeRobot's #777, June 2025.
 
     Before, the zero of shoulder_lift and elbow_flex was the arm stretched out. The old maps are
@@ -486,7 +442,7 @@ def _so_degrees(joints: Sequence[ServoJoint], servos: Servos) -> dict[str, Colum
     return old_columns if excess[1] < excess[0] or (excess[1] == excess[0] and not is_new) else {}
 
 
-def _gripper_column(joint: ServoJoint, servos: Servos, encoding: Encoding) -> Column | None:
+def _gripper_column(joint: JointReadings, servos: Servos, encoding: Encoding) -> Column | None:
     """Return a gripper's map; None: its readings do not determine its position.
 
     If the motor's range is not about as long as the joint's limits, a gear is between them, and the
@@ -501,7 +457,7 @@ def _gripper_column(joint: ServoJoint, servos: Servos, encoding: Encoding) -> Co
         low, high = (motor.high, motor.low) if is_reversed else (motor.low, motor.high)
     else:
         low, high = 0.0, 100.0
-        if not (np.nanmin(joint.readings) >= -0.5 and np.nanmax(joint.readings) <= 100.5):
+        if not is_share(joint.readings, high):
             return None
     if joint.is_angle and _spans_limits(joint, length, turn):
         scale = 2.0 * math.pi * length / turn / (high - low)
@@ -509,82 +465,29 @@ def _gripper_column(joint: ServoJoint, servos: Servos, encoding: Encoding) -> Co
     return _between(joint, low, high)
 
 
-def is_gripper_name(words: Sequence[str]) -> bool:
-    """Return whether a name, given as its words in lower case, is of a gripper's joint."""
-    return not {*words}.isdisjoint({"gripper", "finger", "fingers", "jaw", "claw", "knuckle"})
+def is_share(readings: Array, full: float = 1.0, tolerance: float = 0.005) -> bool:
+    """Return whether readings (n,) can be a gripper's opening, 0 to full.
 
-
-@dataclass(frozen=True)
-class HomingCorrection:
-    """A motor's corrected homing offset."""
-
-    motor: str  # Name of the motor.
-    # before, after: homing offset in the file, and corrected [steps].
-    before: int
-    after: int
-    shift: int  # Increase of the motor's positions by the correction [steps].
-    reason: str = ""  # Why the offset is not corrected; "": it is.
-
-
-def correct_homing(
-    joint: ServoJoint,
-    motor_name: str,
-    column: Column,
-    offset: float,
-    servos: Servos,
-    encoding: Encoding,
-    *,
-    most_lost: float = 0.5,
-) -> HomingCorrection:
-    """Return the homing offset with which LeRobot reads the model's angle of a joint.
-
-    The middle of the motor's range, where LeRobot reads 0, becomes the model's zero. The range's
-    numbers stay, so that its ends are the same angles on both sides of the zero.
-
-    Args:
-        joint: the joint; its readings are not used.
-        motor_name: name of the motor in the calibration file.
-        column: the joint's column, as recorded.
-        offset: the joint's offset, to be added to the recorded positions [rad].
-        servos: the robot's motors.
-        encoding: of the column's readings.
-        most_lost: maximum correction [half the range]; beyond it the model's zero is not meant to
-            be the motor's, as in a model whose limits are all on one side of 0.
+    ``tolerance``: maximum distance outside [full]. nan: missing.
     """
-    motor, step = servos.motors[motor_name], 2.0 * math.pi / servos.turn
-    before = motor.homing
-    if joint.is_gripper:
-        reason = "its readings are an opening of 0 to 100, not an angle"
-        return HomingCorrection(motor_name, before, before, 0, reason)
-    sign = -1.0 if motor.is_inverted and not servos.is_dynamixel and encoding != "deg" else 1.0
-    if servos.has_lists:
-        # Calibrations by lists invert what the motor counts, then add the offset.
-        counted = sign if encoding == "steps" else 1.0
-        shift = round(math.copysign(offset / step, counted * column.scale * offset))
-        return HomingCorrection(motor_name, before, before + shift, shift)
-    middle = 0.5 * (motor.low + motor.high) if encoding == "steps" else 0.0
-    zero = column.scale * middle + column.offset + offset
-    shift, half = round(sign * zero / step), 0.5 * (motor.high - motor.low)
-    if abs(shift) > most_lost * half:
-        reason = (
-            f"the middle of its range is {math.degrees(zero):.0f} degrees in the model, too far "
-            "from its zero: calibrate it again with the arm in the middle of its range"
-        )
-        return HomingCorrection(motor_name, before, before, 0, reason)
-    # Feetech: position = counted - homing offset; Dynamixel: plus.
-    after = before + shift if servos.is_dynamixel else before - shift
-    if not servos.is_dynamixel and abs(after) >= servos.turn // 2:
-        # The register has a sign and 11 bits; positions are modulo a turn.
-        after = max(after - int(math.copysign(servos.turn, after)), 1 - servos.turn // 2)
-    return HomingCorrection(motor_name, before, after, shift)
+    known = readings[np.isfinite(readings)] / full
+    return bool(known.size and -tolerance <= known.min() and known.max() <= 1.0 + tolerance)
 
 
-def dump_column(joint: str, column: Column, offset: float) -> str:
-    """Return a joint's line of a joint map, ``offset`` added to its positions [rad or m]."""
-    scale, constant = float(column.scale), float(column.offset + offset)
-    name = json.dumps(column.name)
-    if column.ends is None:
-        return f"{joint}: {{column: {name}, scale: {scale!r}, offset: {constant!r}}}\n"
-    ends = [float(end) for end in column.ends]
-    values = [scale * end + constant for end in ends]
-    return f"{joint}: {{column: {name}, from: {ends}, to: {values}}}\n"
+def is_gripper_name(name: str) -> bool:
+    """Return whether a name is of a gripper's joint."""
+    grippers = {"gripper", "finger", "fingers", "jaw", "claw", "knuckle"}
+    return not grippers.isdisjoint(name_words(name))
+
+
+def name_words(name: str) -> list[str]:
+    """Return the words in lower case and the numbers of a name, without affixes.
+
+    Affixes are a k before a capital letter, and the last words "joint" and "pos".
+    """
+    words = [word.lower() for word in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+", name)]
+    if len(words) > 1 and re.match("k[A-Z]", name):
+        words = words[1:]
+    while len(words) > 1 and words[-1] in ("joint", "pos"):
+        words = words[:-1]
+    return words

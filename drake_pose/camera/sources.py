@@ -5,13 +5,13 @@ A problem with one image costs only that image, and is reported in `problems`.
 
 import abc
 import math
-import re
 import threading
 import time
 from collections import deque
-from collections.abc import Generator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,13 +22,14 @@ from drake_pose.arrays import Mask, Picture
 from drake_pose.camera.camera_files import load_cameras
 from drake_pose.camera.models import Camera, check_number
 from drake_pose.camera.picture_files import (
-    VideoPictures,
+    Video,
     find_pictures,
+    in_order,
     read_binary_mask,
     read_picture,
     threshold_mask,
 )
-from drake_pose.errors import CameraError, SceneError, SettingsError, listed
+from drake_pose.errors import CameraError, SceneError, listed
 from drake_pose.input_files import named_fields, read_csv, read_yaml
 
 CAMERAS, SOURCES, TIME_STAMPS = "cameras.yaml", "sources.yaml", "timestamps.csv"
@@ -42,7 +43,7 @@ class SourceSpecification:
     Args:
         camera: name of the camera.
         kind: folder: images `<frame>.png` or `.jpg`, optionally with a `timestamps.csv` (frame,
-            time [s]); video: a file that OpenCV reads; device: a live camera.
+            time [s]); video: a file; device: a live camera.
         location: path of the folder or file; number or address of a device.
         width, height: size of the images for which the camera is calibrated [pixel].
         rate_hz: images per second. A folder without time stamps needs it; a video's own rate is the
@@ -50,9 +51,6 @@ class SourceSpecification:
         background: folder of images of the empty room; None: the source provides masks.
         offset: added to time stamps [s], if the cameras' clocks differ.
         beside: folders of other cameras whose images with the same name have the same time.
-
-    Raises:
-        SettingsError: an unknown kind, or an invalid size or rate.
     """
 
     camera: str
@@ -64,15 +62,6 @@ class SourceSpecification:
     background: str | None = None
     offset: float = 0.0
     beside: tuple[str, ...] = ()
-
-    def __post_init__(self) -> None:
-        where = f"the source of camera '{self.camera}'"
-        if self.kind not in ("folder", "video", "device"):
-            raise SettingsError(f"{where}: kind must be folder, video, device, not {self.kind!r}")
-        if self.width < 1 or self.height < 1:
-            raise SettingsError(f"{where}: invalid picture size {self.width} x {self.height}")
-        if self.rate_hz is not None and not (math.isfinite(self.rate_hz) and self.rate_hz > 0):
-            raise SettingsError(f"{where}: rate_hz must be a positive number, not {self.rate_hz}")
 
     @property
     def live(self) -> bool:
@@ -89,7 +78,7 @@ class SourceSpecification:
 
         Raises SceneError, begun by ``where``: the image should be a mask and is not.
         """
-        return threshold_mask(picture, where, SceneError) if self.gives_masks else picture
+        return threshold_mask(picture, where) if self.gives_masks else picture
 
     def size_problem(self, picture: Picture | Mask) -> str:
         """Return what is wrong with an image's size, for messages; "" if it is as calibrated."""
@@ -119,12 +108,14 @@ class FrameSource(abc.ABC):
 
     Attributes:
         specification: the source.
+        rate_hz: approximate images per second, those of a recording that does not state them
+            included; None if unknown.
         problems: problems so far, each with the camera's name; the caller may clear the list.
         dropped: number of images lost to problems.
     """
 
     def __init__(self, specification: SourceSpecification) -> None:
-        self.specification = specification
+        self.specification, self.rate_hz = specification, specification.rate_hz
         self.problems: list[str] = []
         self.dropped = 0
         self._last: TimedPicture | None = None
@@ -133,11 +124,6 @@ class FrameSource(abc.ABC):
     @abc.abstractmethod
     def ended(self) -> bool:
         """Whether no more images will come."""
-
-    @property
-    def rate_hz(self) -> float | None:
-        """Approximate images per second; None if unknown."""
-        return self.specification.rate_hz
 
     @abc.abstractmethod
     def close(self) -> None:
@@ -187,7 +173,7 @@ class DeviceSource(FrameSource):
         super().__init__(specification)
         self._pauses = pauses
         self._newest: deque[TimedPicture] = deque(maxlen=1)
-        self._failed = False
+        self._failed, self._count = False, 0
         self._stop = threading.Event()
         self._thread = threading.Thread(
             target=self._run, name=f"camera {specification.camera}", daemon=True
@@ -209,10 +195,9 @@ class DeviceSource(FrameSource):
 
     def _run(self) -> None:
         """Read until closed; reopen the camera after failures."""
-        given, (first, longest), count = self.specification, self._pauses, 0
-        pause = first
+        given, (pause, longest) = self.specification, self._pauses
         while not self.ended:
-            before, place, is_open = count, given.location, False
+            before, place, is_open = self._count, given.location, False
             with suppress(cv2.error):
                 capture = cv2.VideoCapture(int(place) if place.isdigit() else place)
                 if capture.isOpened() and place.isdigit():
@@ -222,48 +207,42 @@ class DeviceSource(FrameSource):
                         capture.set(cv2.CAP_PROP_FPS, given.rate_hz)
                 is_open = capture.isOpened()
             if is_open:
-                count = self._keep_newest(capture, count)
+                self._keep_newest(capture)
                 capture.release()
             if self.ended:
                 return
             if not self._failed:
-                what = "stopped" if count else "cannot be opened"
+                what = "stopped" if self._count else "cannot be opened"
                 self.report(f"'{given.location}' {what}; retrying until it answers")
                 self._failed = True
-            pause = first if count > before else pause
+            pause = self._pauses[0] if self._count > before else pause
             self._stop.wait(pause)
             pause = min(2.0 * pause, longest)
 
-    def _keep_newest(self, capture: cv2.VideoCapture, count: int) -> int:
-        """Read until the camera is closed or fails, or an image is unusable.
-
-        ``count`` is the number of images so far, from which frames are numbered. Return it with
-        the further images added.
-        """
+    def _keep_newest(self, capture: cv2.VideoCapture) -> None:
+        """Read until the camera is closed or fails, or a picture is unusable."""
+        place = f"'{self.specification.location}'"
         while not self.ended:
             found, picture = False, None
             with suppress(cv2.error):
                 found, picture = capture.read()
             if not found or picture is None:
-                return count
+                return
             stamp = time.monotonic() + self.specification.offset
             rgb = np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), dtype=np.uint8)
-            if wrong := self.specification.size_problem(rgb):
-                self.report(f"'{self.specification.location}' {wrong}")
-                self._stop.set()
-                return count
-            if self._failed:
-                self.report(f"'{self.specification.location}' answers again")
-                self._failed = False
             try:
-                seen = self.specification.convert(rgb, f"'{self.specification.location}'")
+                if wrong := self.specification.size_problem(rgb):
+                    raise SceneError(f"{place} {wrong}")
+                seen = self.specification.convert(rgb, place)
             except SceneError as error:
                 self.report(str(error))
                 self._stop.set()
-                return count
-            self._newest.append(TimedPicture(stamp, f"{count:06d}", seen))
-            count += 1
-        return count
+                return
+            if self._failed:
+                self.report(f"{place} answers again")
+                self._failed = False
+            self._newest.append(TimedPicture(stamp, f"{self._count:06d}", seen))
+            self._count += 1
 
 
 class RecordedSource(FrameSource):
@@ -282,7 +261,6 @@ class RecordedSource(FrameSource):
     def __init__(self, specification: SourceSpecification) -> None:
         super().__init__(specification)
         self._ahead: TimedPicture | None = None
-        self._own_rate: float | None = None
         is_folder = specification.kind == "folder"
         self._pictures = self._of_folder() if is_folder else self._of_video()
         self._ahead = self._advance()
@@ -297,15 +275,10 @@ class RecordedSource(FrameSource):
         """Whether all images were read."""
         return self._ahead is None
 
-    @property
-    def rate_hz(self) -> float | None:
-        """The given rate, or that of the time stamps or the video."""
-        return self.specification.rate_hz or self._own_rate
-
     def close(self) -> None:
         """Release the file."""
         self._ahead = None
-        self._pictures.close()
+        self._pictures = iter(())
 
     def _read(self) -> TimedPicture | None:
         taken = self._ahead
@@ -314,22 +287,34 @@ class RecordedSource(FrameSource):
         return taken
 
     def _advance(self) -> TimedPicture | None:
-        """Return the next image of the calibrated size, or None; SceneError: the first differs."""
-        for path, one in self._pictures:
-            wrong = self.specification.size_problem(one.picture)
+        """Return the next image that can be read, or None; SceneError: the first one's size."""
+        for path, frame, seconds, read in self._pictures:
+            try:
+                picture = read()
+            except SceneError as error:
+                self.drop(str(error))
+                continue
+            wrong = self.specification.size_problem(picture)
             if not wrong:
-                return one
+                return TimedPicture(seconds + self.specification.offset, frame, picture)
             if self._ahead is None:
                 raise SceneError(f"{path}: camera '{self.specification.camera}' {wrong}")
             self.drop(f"{path}: {wrong}")
         return None
 
-    def _of_folder(self) -> Generator[tuple[Path, TimedPicture]]:
-        """Yield the readable images of a folder in order, each with its file; drop the others."""
+    def _of_folder(self) -> Iterator[tuple[Path, str, float, Callable[[], Picture | Mask]]]:
+        """Yield the file, frame, time [s] and reader of each image of a folder, in order."""
         given, folder = self.specification, Path(self.specification.location)
         files = find_pictures(folder, given.camera)
-        stamped = folder / TIME_STAMPS
-        times = read_time_stamps(stamped) if stamped.is_file() else _times_from_rate(given, files)
+        beside = [
+            frame for other in given.beside for frame in find_pictures(Path(other), given.camera)
+        ]
+        times, stamped = picture_times(files, given.rate_hz, beside), folder / TIME_STAMPS
+        if any(map(math.isnan, times.values())):
+            raise SceneError(
+                f"{folder}: has no {TIME_STAMPS} (frame,time), so the source of camera "
+                f"'{given.camera}' needs rate_hz, its pictures per second"
+            )
         for what, where, frames in (
             ("picture", folder, [frame for frame in times if frame not in files]),
             ("time", stamped, [frame for frame in files if frame not in times]),
@@ -341,80 +326,52 @@ class RecordedSource(FrameSource):
         if not timed:
             raise SceneError(f"{stamped}: has no time of any picture in {folder}")
         steps = np.diff([times[frame] for frame in timed])
-        if np.any(steps > 0):
-            self._own_rate = 1.0 / float(np.median(steps[steps > 0]))
+        if self.rate_hz is None and np.any(steps > 0):
+            self.rate_hz = 1.0 / float(np.median(steps[steps > 0]))
+        read: Callable[[Path], Picture | Mask] = read_picture
+        if given.gives_masks:
+            read = partial(read_binary_mask, may_be_empty=True, lossy=True)
         for frame in timed:
-            seen: Picture | Mask
-            try:
-                if given.gives_masks:
-                    seen = read_binary_mask(files[frame], SceneError, may_be_empty=True, lossy=True)
-                else:
-                    seen = read_picture(files[frame], SceneError)
-            except SceneError as error:
-                self.drop(str(error))
-                continue
-            yield files[frame], TimedPicture(times[frame] + given.offset, frame, seen)
+            yield files[frame], frame, times[frame], partial(read, files[frame])
 
-    def _of_video(self) -> Generator[tuple[Path, TimedPicture]]:
-        """Yield the readable images of a video, each with the video's path; drop the others."""
+    def _of_video(self) -> Iterator[tuple[Path, str, float, Callable[[], Picture | Mask]]]:
+        """Yield the file, frame, time [s] and reader of each image of a video."""
         given, path = self.specification, Path(self.specification.location)
         try:
-            video = VideoPictures(path)
+            video = Video(path)
         except SceneError as error:
             raise SceneError(
                 f"{error}, though it is the source of camera '{given.camera}'"
             ) from None
-        self._own_rate = video.rate_hz
-        for k in range(video.count):
-            try:
-                picture = video.read(k)
-            except SceneError:
-                reason = f"{path}: ends after {k} of {video.count} pictures"
-                self.drop(reason, video.count - k)
-                return
-            time = video.time if given.rate_hz is None else k / given.rate_hz
-            try:
-                seen = given.convert(picture, f"{path}: picture {k}")
-            except SceneError as error:
-                self.drop(str(error))
-                continue
-            yield path, TimedPicture(time + given.offset, f"{k:06d}", seen)
+        self.rate_hz, times = given.rate_hz or video.rate_hz, video.times - video.times[0]
+
+        def read(k: int) -> Picture | Mask:
+            return given.convert(video.read(k), f"{path}: picture {k}")
+
+        if given.rate_hz is not None:
+            times = np.arange(len(times)) / given.rate_hz
+        for k, seconds in enumerate(times.tolist()):
+            yield path, f"{k:06d}", seconds, partial(read, k)
+        for text in video.warnings:
+            self.drop(text, video.promised - len(times))
 
 
-def _times_from_rate(given: SourceSpecification, files: Mapping[str, Path]) -> dict[str, float]:
-    """Return the times [s] of frames by name, from their order and rate; the first one is 0.
+def picture_times(
+    files: Mapping[str, Path], rate_hz: float | None, beside: Iterable[str] = ()
+) -> dict[str, float]:
+    """Return the times [s] of the frames of a folder of pictures by name, in order.
 
-    Frames of the folders ``beside`` are included. ``files``: image files by frame. Raises
-    SceneError: there is no rate, or the order of the names is unclear.
+    They are those of the folder's `timestamps.csv`, also of frames without a picture, in its order;
+    or else follow from the frames' natural order and rate, the first being 0; or else are nan.
+
+    ``files``: picture files by frame. ``rate_hz``: frames per second; None: unknown. ``beside``:
+    other frames that are counted. Raises SceneError: `timestamps.csv` lacks a column, has a frame
+    twice, or a time that is not a finite number.
     """
-    folder = Path(given.location)
-    if given.rate_hz is None:
-        raise SceneError(
-            f"{folder}: has no {TIME_STAMPS} (frame,time), so the source of camera "
-            f"'{given.camera}' needs rate_hz, its pictures per second"
-        )
-    names = set(files)
-    for other in given.beside:
-        names |= set(find_pictures(Path(other), given.camera))
-    ordered = sorted(names)
-
-    def by_number(name: str) -> tuple[str, int]:
-        number = re.search(r"(\d+)$", name)
-        return (name[: number.start()], int(number[1])) if number else (name, -1)
-
-    if ordered != sorted(names, key=by_number):
-        raise SceneError(
-            f"{folder}: the frames' names are numbers of different lengths, so their "
-            f"order is unclear; fill them with zeros (0009, 0010) or give a {TIME_STAMPS}"
-        )
-    return {frame: k / given.rate_hz for k, frame in enumerate(ordered)}
-
-
-def read_time_stamps(path: Path) -> dict[str, float]:
-    """Return the times [s] by frame, in the order of the lines of a `timestamps.csv`.
-
-    Raises SceneError: a column is missing, a frame occurs twice, or a time is not a finite number.
-    """
+    path = next(iter(files.values())).with_name(TIME_STAMPS)
+    if not path.is_file():
+        rate = math.nan if rate_hz is None else rate_hz
+        return {frame: k / rate for k, frame in enumerate(in_order((*files, *beside)))}
     header, rows = read_csv(path, SceneError)
     if not {"frame", "time"} <= set(header):
         raise SceneError(f"{path}: needs the columns frame and time [s] in its first line")
@@ -452,17 +409,11 @@ def load_sources(
         raise SceneError(f"{path}: expected a mapping from camera names to their sources")
     cameras = load_cameras(path.with_name(CAMERAS)) if cameras is None else cameras
     entries = {str(name): entry for name, entry in content.items()}
-    unknown = [name for name in entries if name not in cameras]
-    if unknown:
+    if odd := sorted(entries.keys() ^ cameras.keys(), key=list({**entries, **cameras}).index):
+        lacking = CAMERAS if odd[0] in entries else path.name
         raise SceneError(
-            f"{path}: camera '{unknown[0]}' is not calibrated: {CAMERAS} has only "
-            f"{', '.join(cameras)}; calibrate it, or take it out of {path.name}"
-        )
-    missing = [name for name in cameras if name not in entries]
-    if missing:
-        raise SceneError(
-            f"{path}: camera '{missing[0]}' of {CAMERAS} has no source; give it an entry, or take "
-            f"it out of {CAMERAS}"
+            f"{path}: camera '{odd[0]}' is not in {lacking}: {CAMERAS} has {', '.join(cameras)}, "
+            f"{path.name} {', '.join(entries)}; both must name the same cameras"
         )
     found = {name: _read_entry(camera, entries[name], path) for name, camera in cameras.items()}
     # Folders without time stamps, at the same rate, share one numbering of frames.
@@ -504,7 +455,7 @@ def load_background_pictures(specification: SourceSpecification) -> list[Picture
         )
     pictures = []
     for file in find_pictures(folder, camera).values():
-        pictures.append(read_picture(file, SceneError))
+        pictures.append(read_picture(file))
         if wrong := specification.size_problem(pictures[-1]):
             raise SceneError(f"{file}: camera '{camera}' {wrong}")
     return pictures
@@ -517,33 +468,26 @@ def _read_entry(camera: Camera, entry: Any, path: Path) -> SourceSpecification:
     sources.yaml. Raises SceneError: a field is missing, unknown or invalid.
     """
     where = f"{path}: camera '{camera.name}'"
-    fields = ("kind", "location", "rate_hz", "masks", "background", "offset")
-    named_fields(entry, fields, where, SceneError)
-    kind, location = entry.get("kind"), entry.get("location")
+    known = ("kind", "location", "rate_hz", "masks", "background", "offset")
+    given = {"masks": False, "offset": 0.0} | named_fields(entry, known, where, SceneError)
+    kind, location, masks, background = (
+        given.get(name) for name in ("kind", "location", "masks", "background")
+    )
+    if kind not in ("folder", "video", "device"):
+        raise SceneError(f"{where}: kind must be folder, video or device, not {kind!r}")
     if isinstance(location, bool) or not isinstance(location, str | int) or location == "":
         raise SceneError(f"{where}: location must be a path, or a device's number or address")
-    if kind != "device":
-        location = path.parent / str(location)
-    masks, background = entry.get("masks", False), entry.get("background")
-    if not isinstance(masks, bool) or masks == (background is not None):
+    if not isinstance(masks, bool) or masks == isinstance(background, str):
         raise SceneError(
             f"{where}: needs either 'masks: true', where its pictures are masks of the person, or "
             "'background: FOLDER', pictures of the empty room"
         )
-    if background is not None:
-        if not isinstance(background, str):
-            raise SceneError(f"{where}: background must be a folder of pictures")
-        background = str(path.parent / background)
+    place = str(location) if kind == "device" else str(path.parent / str(location))
+    room, rate = None if background is None else str(path.parent / background), given.get("rate_hz")
     try:
-        rate, offset = entry.get("rate_hz"), entry.get("offset", 0.0)
-        rate = None if rate is None else check_number(rate, "rate_hz", where)
-        offset = check_number(offset, "offset", where)
+        rate = None if rate is None else check_number(rate, "rate_hz", where, positive=True)
+        offset = check_number(given["offset"] or 0.0, "offset", where)
     except CameraError as error:
         raise SceneError(str(error)) from None
     size = camera.width, camera.height
-    try:
-        return SourceSpecification(
-            camera.name, str(kind), str(location), *size, rate, background, offset
-        )
-    except SettingsError as error:
-        raise SceneError(f"{path}: {error}") from None
+    return SourceSpecification(camera.name, kind, place, *size, rate, room, offset)

@@ -6,18 +6,20 @@ Results go to stdout; messages, warnings and progress bars to stderr.
 from __future__ import annotations
 
 import json
-import math
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
+from markupsafe import Markup
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
 
+from drake_pose.errors import weight_of
 from drake_pose.files.settings import RUNNING, within
 
 if TYPE_CHECKING:
@@ -58,9 +60,13 @@ Pictures = Annotated[
 ]
 Seed = Annotated[int, within(0), Parameter(help="Seed of the random numbers.")]
 Resume = Annotated[bool, RUNNING, Parameter(help="Continue the interrupted result in --out.")]
-Replay = Annotated[bool, RUNNING, Parameter(negative="--no-replay", help="Write replay.html.")]
+Replay = Annotated[
+    bool, RUNNING, Parameter(negative="--no-replay", help="Write replay.html. Default: yes.")
+]
 Overlay = Annotated[
-    bool, RUNNING, Parameter(negative="--no-overlay", help="Write overlay/<camera>/<frame>.png.")
+    bool,
+    RUNNING,
+    Parameter(negative="--no-overlay", help="Write pictures into overlay/. Default: yes."),
 ]
 Json = Annotated[bool, RUNNING, Parameter(help="Print the result as JSON.")]
 
@@ -76,9 +82,10 @@ def say(message: str) -> None:
 
 
 def warn(*messages: str) -> None:
-    """Print warnings to stderr."""
+    """Print warnings to stderr, with their weights."""
+    words = {"wrong": "warning: wrong answer likely", "check": "warning", "note": "note"}
     for message in messages:
-        say(f"drake-pose: warning: {message}")
+        say(f"drake-pose: {words[weight_of(message)]}: {message}")
 
 
 def print_json(value: Mapping[str, Any]) -> None:
@@ -89,18 +96,34 @@ def print_json(value: Mapping[str, Any]) -> None:
 
 
 def print_result(result: Any, json: bool, print_text: Callable[[Any], None]) -> None:
-    """Print a result's warnings to stderr, and its summary or text to stdout.
+    """Print a result's warnings to stderr, and its summary, or text and next steps, to stdout.
 
     Args:
-        result: a job's result, with the attributes ``warnings`` and ``summary``.
+        result: a job's result, with the attributes ``warnings``, ``summary`` and ``folder``.
         json: whether the summary is printed as JSON.
         print_text: prints the result as text, if ``json`` is False.
     """
     warn(*result.warnings)
     if json:
         print_json(result.summary)
-    else:
-        print_text(result)
+        return
+    print_text(result)
+    print_next(result.folder, result.summary)
+
+
+def print_line(text: str) -> None:
+    """Print a text to stdout, unwrapped unless stdout is a terminal."""
+    output_console().print(escape(text), soft_wrap=True)
+
+
+def print_table(head: Sequence[str], rows: Iterable[Sequence[str]], title: str = "") -> None:
+    """Print a table to stdout, without the markup of its cells; nothing without rows."""
+    table = Table(*map(escape, head), title=escape(title) or None)
+    for row in rows:
+        texts = (cell.striptags() if isinstance(cell, Markup) else cell for cell in row)
+        table.add_row(*map(escape, texts))
+    if table.row_count:
+        output_console().print(table)
 
 
 def output_console() -> Console:
@@ -109,26 +132,18 @@ def output_console() -> Console:
     return console if console.is_terminal else Console(highlight=False, width=160)
 
 
-def print_files(*files: tuple[str, Path]) -> None:
-    """Print label and path of each file that exists."""
-    for label, path in files:
-        if path.exists():
-            output_console().print(f"{label:<14} {escape(str(path))}", soft_wrap=True)
+def print_next(folder: Path | None, summary: Mapping[str, Any]) -> None:
+    """Print the files of a result folder, and what to do with each; nothing for None."""
+    from drake_pose.files.folder import REPORT
+    from drake_pose.files.page import next_steps
 
-
-def worst_frames(errors: Sequence[float | None], most: int = 30) -> tuple[list[int], str]:
-    """Return the indices of the worst frames, ascending, and a text to append to a table's title.
-
-    The text is "" if these are all frames.
-
-    Args:
-        errors: error of each frame; nan or None if no pose was found, which counts as worst.
-        most: maximum number of frames.
-    """
-    badness = [math.inf if one is None or math.isnan(one) else one for one in errors]
-    shown = sorted(sorted(range(len(errors)), key=lambda k: -badness[k])[:most])
-    is_all = len(shown) == len(errors)
-    return shown, "" if is_all else f": the worst {len(shown)} of {len(errors)} frames"
+    if folder is None:
+        return
+    print_line(f"result               {folder}")
+    files = [(REPORT, "start here: answer, warnings and pictures on one page")]
+    for name, use in (*files, *next_steps(folder, summary)):
+        if (folder / name).exists():
+            print_line(f"{name:<20} {use}")
 
 
 def progress_bar() -> Progress:

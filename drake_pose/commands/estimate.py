@@ -9,9 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
-from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
 from drake_pose.commands.common import (
     SPREAD,
@@ -26,15 +23,15 @@ from drake_pose.commands.common import (
     UsageError,
     count_progress,
     frame_progress,
-    output_console,
-    print_files,
     print_json,
+    print_line,
+    print_next,
     print_result,
+    print_table,
     progress_bar,
     say,
     warn,
     within,
-    worst_frames,
 )
 from drake_pose.errors import SceneError, listed
 from drake_pose.files.settings import (
@@ -125,84 +122,41 @@ def demo(
 
 
 def _print_estimate(result: SceneEstimate) -> None:
-    """Print the worst frames, joint errors if ground truth is given, totals and files."""
-    console = output_console()
-    kinds = zip(result.position_names, result.position_kinds, strict=True)
-    angles = {name for name, kind in kinds if kind == "angle"}
-    compared = {f: one.joint_errors for f, one in result.records.items() if one.joint_errors}
-    if result.summary["method"] == "person":
-        console.print("One person was fitted to all silhouettes at once (--method person).")
-        table = Table("camera", "frames", "mean IoU")
-        for camera, one in result.summary["cameras"].items():
-            table.add_row(escape(camera), str(one["frames"]), percent(one["mean_iou"]))
-    else:
-        records = list(result.records.items())
-        shown, which = worst_frames([record.E_total for _, record in records])
-        names = ["frame", "E_total", "before", "runs", "seconds"]
-        names += ["mean joint error"] if compared else []
-        table = Table(*names, title=f"Estimate{which}")
-        for frame, record in (records[k] for k in shown):
-            turns = [abs(e) for name, e in record.joint_errors.items() if name in angles]
-            table.add_row(
-                escape(frame),
-                percent(record.E_total),
-                percent(record.first_E_total),
-                "" if record.runs is None else str(record.runs),
-                f"{record.seconds:.2f}",
-                *([f"{sum(turns) / len(turns):.1f} deg" if turns else "-"] if compared else []),
-            )
-    console.print(table)
-    if compared:
-        # Estimate minus measured position, by joint (rows) and frame (columns).
-        few = list(compared)[:8]
-        table = Table("joint", "mean", "largest", *map(escape, few), title="Joint errors")
-        for name, errors in result.summary["joint_errors"].items():
-            unit, digits = ("deg", 1) if name in angles else ("m", 3)
-            ends = (f"{errors[key]:.{digits}f} {unit}" for key in ("mean", "largest"))
-            each = (f"{compared[frame][name]:+.{digits}f}" for frame in few)
-            table.add_row(escape(name), *ends, *each)
-        console.print(table)
-    _print_totals(console, result)
+    """Print the answer, and joint errors if positions were measured."""
+    from drake_pose.files.page import estimate_answer
+
+    print_line(estimate_answer(result)[0])
+    kinds = dict(zip(result.position_names, result.position_kinds, strict=True))
+    rows = []
+    for name, errors in result.summary["joint_errors"].items():
+        unit, digits = ("deg", 1) if kinds[name] == "angle" else ("m", 3)
+        ends = (f"{errors[key]:.{digits}f} {unit}" for key in ("mean", "largest"))
+        rows.append((name, *ends))
+    print_table(("joint", "mean", "largest"), rows, "Joint errors")
 
 
 def _print_demo(result: SceneEstimate) -> None:
-    """Print the joint angles, error and time of the only frame, and where the overlay is."""
+    """Print the joint angles and error of the only frame, and where the overlay is."""
     from drake_pose.files.folder import OVERLAY
+    from drake_pose.files.page import estimate_answer
 
-    console = output_console()
-    table = Table("joint", "value", title="Joint angles of the man in the picture")
     (record,) = result.records.values()
+    rows = []
     for name, kind, value in zip(
         result.position_names, result.position_kinds, record.q, strict=True
     ):
-        text = f"{value:.3f} m" if kind == "length" else f"{value:.4f}"
-        text = f"{math.degrees(value):.1f} deg" if kind == "angle" else text
-        table.add_row(escape(name), text if math.isfinite(value) else "-")
-    console.print(table)
-    _print_totals(console, result)
-    if result.folder is not None:
-        print_files(*(("overlay", path) for path in (result.folder / OVERLAY).glob("*/*.png")))
-    console.print(
-        "Overlay: body and silhouette agree (light grey), silhouette only (blue), body only "
-        "(orange). Kameda, Minoh and Ikeda report an error of 22.3 % for six pictures of a woman, "
-        "with a model of her."
+        angle = f"{math.degrees(value):.1f} deg"
+        rows.append((name, angle if kind == "angle" else f"{value:.3f} m"))
+    print_table(("joint", "value"), rows, "Joint angles of the man in the picture")
+    print_line(
+        f"{estimate_answer(result)[0]} Kameda, Minoh and Ikeda report 22.3 % for six pictures of a "
+        "woman, with a model of her."
     )
-
-
-def _print_totals(console: Console, result: SceneEstimate) -> None:
-    """Print numbers of frames, mean errors, the median time, and the files written."""
-    from drake_pose.files.folder import POSES, REPLAY, REPORT
-
-    summary = result.summary
-    console.print(f"found          {result.found_count} of {len(result.records)} frames")
-    console.print(f"E_total        {percent(summary['mean_E_total'])} on average")
-    console.print(f"seconds        {summary['median_seconds']:.2f} per frame (median)")
-    if summary["mean_iou"] is not None:
-        frames = f"{summary['compared_count']} of {len(result.records)} frames"
-        console.print(f"IoU            {percent(summary['mean_iou'])} on average, {frames}")
-    if result.folder is not None:
-        files = {"poses": POSES, "report": REPORT, "replay": REPLAY}
-        print_files(*((label, result.folder / file) for label, file in files.items()))
+    for path in result.folder.glob(f"{OVERLAY}/*/*.png") if result.folder else ():
+        print_line(
+            f"overlay              {path}: body and silhouette agree (light grey), silhouette "
+            "only (blue), body only (orange)"
+        )
 
 
 def capture(
@@ -277,15 +231,17 @@ def capture(
     elif found.records:
         _print_estimate(found)
         # Use of each camera's pictures, and the times at which it stopped and returned.
-        table = Table("camera", "pictures used", "unusable", "too late", "stopped and returned")
+        rows = []
         for name, source in found.summary["sources"].items():
             changes = [
                 f"{one['what']} at {one['time']:.2f} s" if one["time"] is not None else "gave none"
                 for one in source["changes"]
             ]
             numbers = [str(source[what]) for what in ("used", "dropped", "late")]
-            table.add_row(escape(name), *numbers, ", ".join(changes))
-        output_console().print(table)
+            rows.append((name, *numbers, ", ".join(changes)))
+        head = ("camera", "pictures used", "unusable", "too late", "stopped and returned")
+        print_table(head, rows)
+        print_next(found.folder, found.summary)
     if not found.records:
         raise SceneError("no camera gave a picture")
     if not found.found_count:
@@ -339,7 +295,7 @@ def batch(
 
     A scene with the key audit is audited; all errors are listed in findings.csv. Of episodes in one
     data set or folder the first is searched, and the others start at its cameras; episodes.csv and
-    episodes.png tell which episodes share a camera's pose, and when a camera moved.
+    report.html tell which episodes share a camera's pose, and when a camera moved.
 
         drake-pose batch jobs.yaml --out results/all --workers 2
 
@@ -388,25 +344,20 @@ def batch(
 
 def _print_batch(result: Batch) -> None:
     """Print a row for each scene, with some errors of audited ones, and the folder."""
-    estimates = Table("scene", "state", "found", "E_total", "chunks", "seconds", title="Batch")
-    audits = Table("scene", "state", "consistent", "errors", "seconds", title="Audits")
+    estimates, audits = [], []
     for name, state in result.scenes.items():
         totals, seconds = state.totals, f"{state.seconds:.1f}"
         count = "found_count" if state.job.audit is None else "agreeing_count"
-        good = f"{totals.get(count)} of {state.frame_count}" if totals else ""
-        row = (escape(name), state.state, good)
+        row = (name, state.state, f"{totals.get(count)} of {state.frame_count}" if totals else "")
         if state.job.audit is None:
             chunks = f"{len(state.done)} of {len(state.tasks)}"
-            estimates.add_row(*row, percent(totals.get("mean_E_total")), chunks, seconds)
+            estimates.append((*row, percent(totals.get("mean_E_total")), chunks, seconds))
         else:
             named = [f"{one['what']} {one['name']}" for one in totals.get("findings", ())]
-            audits.add_row(*row, escape(listed(named)), seconds)
-    console = output_console()
-    for table in (estimates, audits):
-        if table.row_count:
-            console.print(table)
-    for text in result.moves:
-        console.print(escape(text), soft_wrap=True)
+            audits.append((*row, listed(named), seconds))
+    print_table(("scene", "state", "found", "E_total", "chunks", "seconds"), estimates, "Batch")
+    print_table(("scene", "state", "consistent", "errors", "seconds"), audits, "Audits")
     frames = sum(state.frames_done for state in result.scenes.values())
-    console.print(f"frames         {frames} in {result.seconds:.1f} s")
-    print_files(("results", result.out))
+    for text in (*result.moves, f"{frames} frames in {result.seconds:.1f} s"):
+        print_line(text)
+    print_next(result.out, {})

@@ -20,7 +20,7 @@ from drake_pose.commands.common import (
 )
 
 if TYPE_CHECKING:
-    from rich.console import RenderableType
+    from rich.table import Table
 
     from drake_pose.papers.tables import Count
 
@@ -56,16 +56,12 @@ def kameda(
         views: With --angles continuous: number of cameras. Default: 1.
     """
     is_continuous = angles == "continuous"
-    needed, fit = "--angles continuous", {"seed", "method", "angles"}
-    if experiment != "A":
-        needed, fit = "--experiment A", set()
-    elif is_continuous:
-        needed, fit = "--angles grid", {"seed", "angles", "views"}
-    given = {"seed": seed, "method": method, "angles": angles, "views": views}
-    for name, value in given.items():
-        if value is not None and name not in fit:
-            raise UsageError(f"--{name} needs {needed}")
-    first = seed or 0
+    if experiment != "A" and (method or angles or views or seed is not None):
+        raise UsageError("--method, --angles, --views and --seed need --experiment A")
+    if is_continuous and method:
+        raise UsageError("--method needs --angles grid")
+    if views and not is_continuous:
+        raise UsageError("--views needs --angles continuous")
     warnings: list[str] = []
     with _experiment(out) as count:
         from drake_pose.papers import kameda as poses
@@ -79,22 +75,22 @@ def kameda(
                 warnings += [f"{name}: {text}" for text in real[method]["warnings"]]
         elif is_continuous:
             search = MultiStartSearch(poses.experiment_tree(), exact_masks=True)
-            result = poses.run_experiment(search, images, first, count, views or 1)
+            result = poses.run_experiment(search, images, seed or 0, count, views or 1)
             figures, table = poses.continuous_figures(result), poses.continuous_table(result)
         else:
             # For the comparison the published search runs on as many images as in the paper.
             is_beam = method == "beam"
             few = min(images, int(poses.PAPER["images"])) if is_beam else images
-            runs = [poses.run_experiment(poses.experiment_search(), few, first, count)]
+            runs = [poses.run_experiment(poses.experiment_search(), few, seed or 0, count)]
             if is_beam:
                 beam = poses.beam_experiment_search()
-                runs.append(poses.run_experiment(beam, images, first, count))
+                runs.append(poses.run_experiment(beam, images, seed or 0, count))
             figures, table = poses.grid_figures(runs[-1]), poses.grid_table(runs)
             if is_beam:
                 figures["paper_method"] = poses.grid_figures(runs[0])
             if out is not None:
                 save_poses(runs[-1], out)
-    _show(figures, [table], json, warnings)
+    _show(figures, [table], json, warnings, out)
 
 
 def shimada(
@@ -165,7 +161,7 @@ def shimada(
             figures, table = result.as_json(), hands.result_table(result)
             if out is not None:
                 save_hands(result, out)
-    _show(figures, [table], json, warnings)
+    _show(figures, [table], json, warnings, out)
 
 
 def date(
@@ -203,12 +199,12 @@ def date(
             figures, pictures = people.run_walk_through(cameras, seed, count)
             if out is not None:
                 save_walk(pictures, out)
-            _show(figures, [people.walk_table(figures)], json)
+            _show(figures, [people.walk_table(figures)], json, out=out)
             return
         result = people.run_experiment(cameras, frames, seed, method, count)
         if out is not None:
             save_captures(result, out)
-    _show(result.as_json(), [*result.tables(), result.costs()], json)
+    _show(result.as_json(), [*result.tables(), result.costs()], json, out=out)
 
 
 @contextmanager
@@ -231,19 +227,25 @@ def _experiment(out: Path | None) -> Iterator[Count]:
 
 def _show(
     figures: Mapping[str, Any],
-    shown: Sequence[RenderableType],
+    shown: Sequence[Table | str],
     json: bool,
     warnings: Sequence[str] = (),
+    out: Path | None = None,
 ) -> None:
-    """Print warnings to stderr, and results to stdout.
+    """Print warnings to stderr, and results to stdout; write them to a page.
 
     Args:
         figures: all results, printed if ``json`` is True.
         shown: tables of the main results, printed otherwise.
         json: whether JSON is printed.
         warnings: messages for the user.
+        out: folder for the page report.html; None: none is written.
     """
     warn(*warnings)
+    if out is not None:
+        from drake_pose.papers.tables import save_page
+
+        save_page(out, shown, warnings)
     if json:
         print_json(figures)
     else:

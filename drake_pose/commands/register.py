@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
-from rich.markup import escape
-from rich.table import Table
 
 from drake_pose.commands.common import (
     SPREAD,
@@ -20,13 +18,12 @@ from drake_pose.commands.common import (
     Out,
     Overlay,
     count_progress,
-    output_console,
-    print_files,
     print_json,
+    print_line,
     print_result,
+    print_table,
     say,
     warn,
-    worst_frames,
 )
 from drake_pose.errors import ModelError, RegistrationError, listed
 from drake_pose.files.settings import (
@@ -34,7 +31,6 @@ from drake_pose.files.settings import (
     MaskSettings,
     Packages,
     RegistrationSettings,
-    percent,
 )
 
 if TYPE_CHECKING:
@@ -152,110 +148,24 @@ def _stop_if_refused(refused: Sequence[str], accepted: int) -> None:
 
 
 def _print_registration(result: SceneRegistration) -> None:
-    """Print the camera poses with standard deviations, other estimates, and the worst frames."""
-    from drake_pose.files.folder import REPORT
-    from drake_pose.jobs.registration.result import PARAMETERS, parameter_rows
-    from drake_pose.silhouette.pictures.scenes import CAMERA_FILE
+    """Print the answer, the camera poses with standard deviations, and other estimates."""
+    from drake_pose.jobs.registration import pages
 
-    console = output_console()
-    table = Table(
-        "camera", "position, m", "sd, mm", "sd, deg", "poses", "inliers", "mean IoU", "seconds",
-        title="Cameras in the robot's world",
-    )  # fmt: skip
-    for name, found in result.registered.items():
-        one = result.summary["cameras"][name]
-        agreeing = len(found.frames) - len(found.outliers)
-        table.add_row(
-            escape(name),
-            ", ".join(f"{p:.4f}" for p in found.camera.X_WC[:3, 3]),
-            f"{one['translation_sd_mm']:.2f}",
-            f"{one['rotation_sd_deg']:.3f}",
-            str(len(one["modes"])),
-            f"{agreeing} of {len(found.frames)}",
-            percent(one["mean_iou"]),
-            f"{one['seconds']:.1f}",
-        )
-    console.print(table)
-    for name, one in result.summary["cameras"].items():
+    cameras = result.summary["cameras"]
+    print_line(pages.registration_answer(cameras, result.refused))
+    for table in (pages.camera_table(cameras), *pages.robot_tables(cameras)):
+        print_table(table.head, table.rows, table.closed)
+    for name, one in cameras.items():
         if "time_offset_scores" in one or "points" in one:
-            console.print(escape(f"camera '{name}': {_say_clock(one)}"), soft_wrap=True)
-    first = next(iter(result.summary["cameras"].values()))
-    for key, title, of, what in PARAMETERS:
-        if first[key]:
-            parameters = Table(of, what, "95 % interval", "", title=title)
-            for row in parameter_rows(first[key]):
-                parameters.add_row(*map(escape, row))
-            console.print(parameters)
-    if target := first.get("target"):
-        place = ", ".join(f"{row[3]:.4f}" for row in target["X_WT"][:3])
-        console.print(
-            f"target at {place} m in the robot's world, sd {target['translation_sd_mm']:.2f} mm, "
-            f"{target['rotation_sd_deg']:.3f} deg; "
-            f"poses in which it looks the same: {len(target['modes'])}"
-        )
-    misfits = [(name, one) for name, own in result.registered.items() for one in own.frames]
-    if "points" in first:
-        shown, which = worst_frames([-misfit.inlier_ratio for _, misfit in misfits], 8)
-        frames = Table("camera", "frame", "points that fit", "", title=f"Standing scene{which}")
-        shares: list[tuple[str, ...]] = [(percent(misfit.inlier_ratio),) for _, misfit in misfits]
-    else:
-        shown, which = worst_frames([misfit.E_total for _, misfit in misfits], 8)
-        frames = Table("camera", "frame", "E_total", "IoU", "", title=f"Masks and robot{which}")
-        shares = [(percent(misfit.E_total), percent(misfit.iou)) for _, misfit in misfits]
-    for k in shown:
-        name, misfit = misfits[k]
-        word = "" if misfit.is_inlier else "outlier"
-        frames.add_row(escape(name), escape(misfit.frame), *shares[k], word)
-    console.print(frames)
-    if result.folder is not None:
-        print_files(("cameras", result.folder / CAMERA_FILE), ("report", result.folder / REPORT))
-
-
-def _say_clock(one: Mapping[str, Any]) -> str:
-    """Return a text of evidence, time offset and focal length in an entry of summary.json."""
-    if "points" in one:
-        texts = [
-            f"from {one['points']} points of the scene: {percent(one['sightings_that_fit'])} of "
-            f"{one['sightings']} sightings fit; the pose explains {percent(one['explained'])} of "
-            f"the matches, and chance {percent(one['explained_by_chance'])}"
-        ]
-    else:
-        texts = [
-            f"its pose explains {percent(one['explained'])} of the changes in its pictures (by "
-            f"chance: p-value {one['p_value']:.1g})"
-        ]
-    if one["time_offset_s"] is not None:
-        value, deviation = 1e3 * one["time_offset_s"], 1e3 * one["time_offset_sd_s"]
-        word = "later" if value > 0.0 else "earlier"
-        texts.append(
-            f"its pictures show the joints {abs(value):.0f} ms {word} than their time stamps say "
-            f"(sd {deviation:.0f} ms)"
-        )
-    else:
-        texts.append("its time offset is not determined")
-    if one["focal_sd_px"] is not None:
-        texts.append(f"focal length {one['focal_px']:.1f} pixels (sd {one['focal_sd_px']:.1f})")
-    return "; ".join(texts)
+            print_line(f"camera '{name}': {pages.clock_text(one)}")
 
 
 def _print_audit(result: SceneAudit) -> None:
-    """Print the errors, the number of consistent frames, and minimum detectable offsets."""
-    console = output_console()
-    findings = result.summary["findings"]
-    if findings:
-        table = Table("error", title="Errors in joint positions, cameras and frames")
-        for one in findings:
-            table.add_row(escape(one["text"]))
-        console.print(table)
-    count, agree = result.summary["frame_count"], result.summary["agreeing_count"]
-    console.print(f"{agree} of {count} frames are consistent")
-    if not findings:
-        but = ", but see the warnings" if result.warnings else ""
-        say(f"drake-pose: no error found{but}")
-    if result.undetectable:
-        console.print(result.undetectable, soft_wrap=True)
-    if result.folder is not None:
-        print_files(("result", result.folder))
+    """Print the answer and the errors."""
+    print_line(result.answer)
+    summary = result.summary
+    print_table(("error",), [(one["text"],) for one in summary["findings"]])
+    print_line(f"{summary['agreeing_count']} of {summary['frame_count']} frames are consistent")
 
 
 def check(file: Path, /, *, package: Packages | None = None, json: Json = False) -> None:
@@ -283,11 +193,7 @@ def check(file: Path, /, *, package: Packages | None = None, json: Json = False)
     if json:
         print_json({**asdict(report), "path": str(report.path), "usable": report.usable})
     elif report.usable:
-        table = Table(
-            "segment", "hangs on", "joints in the order of rotation", "triangles", "closed",
-            title=escape(f"{report.name}: {len(report.nodes)} segments"),
-        )  # fmt: skip
-        units = {"angle": " deg", "length": " m"}
+        units, rows = {"angle": " deg", "length": " m"}, []
         for node in report.nodes:
             joints = [
                 "{name}  {lower:g} .. {upper:g}".format(**joint)
@@ -296,9 +202,9 @@ def check(file: Path, /, *, package: Packages | None = None, json: Json = False)
                 for joint in node["joints"]
             ]
             texts = node["name"], node["parent"], "\n".join(joints) or "fixed"
-            closed = "yes" if node["watertight"] else "no"
-            table.add_row(*map(escape, texts), str(node["triangles"]), closed)
-        output_console().print(table)
+            rows.append((*texts, str(node["triangles"]), "yes" if node["watertight"] else "no"))
+        head = ("segment", "hangs on", "joints in the order of rotation", "triangles", "closed")
+        print_table(head, rows, f"{report.name}: {len(report.nodes)} segments")
     warn(*report.warnings)
     if report.errors:
         raise ModelError("; ".join(report.errors))
@@ -340,11 +246,9 @@ def masks(
 
 
 def _print_masks(result: SceneMasks) -> None:
-    """Print the number and sizes of each camera's masks, and the scene's folder."""
-    console = output_console()
+    """Print the number and sizes of each camera's masks."""
     for name, frames in result.summary["cameras"].items():
         good = [one["area"] for one in frames.values() if "area" in one]
         text = f"{len(good)} masks of {len(frames)} pictures"
         text += f", {min(good)} to {max(good)} pixels" if good else ""
-        console.print(f"{escape(name or 'camera'):<14} {text}")
-    print_files(("scene", result.folder))
+        print_line(f"{name or 'camera':<20} {text}")

@@ -24,6 +24,9 @@ JOINT_CENTRES = "joint_centres.csv"
 TRC, MOT = "joint_centres.trc", "positions.mot"
 OVERLAY, SHAPES = "overlay", "shapes.png"
 
+OVERLAY_MODES, AS_GIVEN = "overlay_modes", "overlay_as_given"
+"""Folders of drawn modes, and of pictures that compare what was given and what was found."""
+
 _Job = TypeVar("_Job", bound=Callable[..., Any])
 
 RESULT_FILES = (

@@ -2,11 +2,19 @@
 
 import io
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Collection, Sequence
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from PIL import Image
+
+from drake_pose.arrays import Array, Mask, Picture
+from drake_pose.body import PoseTree
+from drake_pose.body.tree_kinematics import TreeKinematics
+from drake_pose.camera.models import Camera, ParallelCamera
+from drake_pose.silhouette.outline import Outline, outline_from_mesh
+from drake_pose.silhouette.scoring import draw_labels
 
 Colour = tuple[int, int, int]
 
@@ -16,6 +24,7 @@ AGREEMENT_RGB = (215, 215, 215)
 MISSING_RGB = (0, 114, 178)
 EXCESS_RGB = (213, 94, 0)
 OUTLINE_RGB = (0, 0, 0)
+KNOWN_RGB, OPEN_RGB = (86, 160, 210), (150, 150, 150)
 
 _TEXT_RGB = (255, 255, 255)
 # Overlays of silhouettes have few colours: drawing and encoding palette indices takes a third of
@@ -117,6 +126,58 @@ def draw_shapes(
         _draw_contour(picture, _enlarged(shape[window]), colour, 2)
     legend += zip(colours, names, strict=True)
     return _framed(picture, title, legend)
+
+
+def body_drawer(
+    tree: PoseTree, visible_nodes: Collection[str] | None
+) -> Callable[[Camera, Array], NDArray[np.intp]]:
+    """Return a function that draws the body as seen by a camera, at values (m,) of the pose tree.
+
+    The drawing (H, W) has for each pixel the index of the drawn node that it shows, or -1.
+
+    visible_nodes: names of the nodes that are drawn; None: all.
+    """
+    kinematics, names = TreeKinematics(tree), visible_nodes
+    shown = [k for k, node in enumerate(tree.nodes) if names is None or node.name in names]
+    outlines = [outline_from_mesh(tree.nodes[k].mesh) for k in shown]
+
+    def draw(camera: Camera, values: Array) -> NDArray[np.intp]:
+        X_CN = camera.X_CW @ kinematics.poses(values)[shown]
+        labels = draw_labels(outlines, np.arange(1, len(shown) + 1), X_CN, camera)
+        return np.asarray(labels, np.intp) - 1
+
+    return draw
+
+
+def draw_modes(
+    bodies: Sequence[tuple[Sequence[Outline], Array]], camera: Camera, known: Mask, side: int = 380
+) -> Picture:
+    """Draw poses of a body along a camera's axis, and from its side; several have a row each.
+
+    ``bodies``: outlines of the nodes, and their poses X_WN (nodes, 4, 4), of each pose. ``known``:
+    (nodes,) nodes in blue; others are grey. ``side``: side of a drawing [pixel].
+
+    Returns (h, w, 3) uint8 RGB.
+    """
+    colours = np.array([BACKGROUND_RGB, *np.where(known[:, None], KNOWN_RGB, OPEN_RGB)], np.uint8)
+    turn, rows = np.array([[0.0, 0, -1], [0, 1, 0], [1, 0, 0]]), list[Picture]()
+    for number, (outlines, X_WN) in enumerate(bodies, 1):
+        points = [o.vertices @ X[:3, :3].T + X[:3, 3] for o, X in zip(outlines, X_WN, strict=True)]
+        ends = np.array([f(np.concatenate(points), axis=0) for f in (np.min, np.max)])
+        middle, size = ends.mean(axis=0), float(np.linalg.norm(ends[1] - ends[0]))
+        row, of = [], f"  pose {number} of {len(bodies)}" if len(bodies) > 1 else ""
+        for R, words in ((np.eye(3), "as the camera sees it"), (turn, "from the side")):
+            X_WC = np.array(camera.X_WC)
+            X_WC[:3, :3] = X_WC[:3, :3] @ R
+            X_WC[:3, 3] = middle - size * X_WC[:3, 2]
+            half = 0.5 * (side - 1)
+            view = ParallelCamera("", side, side, 0.96 * side / size, half, half, X_WC)
+            nodes = draw_labels(outlines, range(1, 1 + len(outlines)), view.X_CW @ X_WN, view)
+            drawn = colours[nodes]
+            _draw_borders(drawn, nodes > 0, nodes, OUTLINE_RGB)
+            row.append(_framed(drawn, words + of, least_width=side))
+        rows.append(np.hstack(row) if len(bodies) > 1 else np.vstack(row))
+    return np.vstack(rows)
 
 
 def encode_png(picture: np.ndarray) -> bytes:

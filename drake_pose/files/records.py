@@ -21,7 +21,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 
 from drake_pose.arrays import Array
 from drake_pose.body import ArticulatedModel, PoseTree, nearest_turn
-from drake_pose.errors import OutputError, SettingsError
+from drake_pose.errors import OutputError, SettingsError, weight_of, weighted
 from drake_pose.files.folder import POSES, cannot_write, read_summary, write_file
 from drake_pose.files.settings import SceneSettings, percent
 from drake_pose.input_files import csv_text, digest, read_csv, read_number, read_regular
@@ -61,7 +61,7 @@ class FrameRecord:
     # E_total of the first whole pose, before it was refined or estimated again.
     first_E_total: float | None = None
     runs: int | None = None  # Number of times the search placed a segment, or compared contours.
-    # Why the search ended: "end", "exact", "run_limit" or "time_limit"; "tracked" if the pose was
+    # Why the search ended: "end", "exact" or "run_limit"; "tracked" if the pose was
     # tracked, "followed" if a person was.
     stopped_by: str | None = None
     # Kameda's r in each view: allowed area of a segment outside the mask [pixel].
@@ -414,6 +414,7 @@ def summarize(
     records: Mapping[str, FrameRecord],
     complete: bool,
     more: Mapping[str, Any] | None = None,
+    warnings: Iterable[str] = (),
 ) -> dict[str, Any]:
     """Return the content of summary.json.
 
@@ -422,6 +423,7 @@ def summarize(
         records: finished frames by name.
         complete: whether all frames are finished.
         more: further entries, of the method; None: none.
+        warnings: messages for the user.
     """
     ious = [iou for record in records.values() for iou in record.ious.values()]
     errors = [record.E_total for record in records.values() if record.E_total is not None]
@@ -444,10 +446,17 @@ def summarize(
         },
         "cameras": describe_cameras(records),
         **(more or {}),
+        **describe_warnings(warnings),
         **job,
         "versions": versions(),
         "frames": {name: record.as_json() for name, record in records.items()},
     }
+
+
+def describe_warnings(warnings: Iterable[str]) -> dict[str, list[str]]:
+    """Return warnings, each once, and their weights (`weight_of`) as parts of summary.json."""
+    texts = list(dict.fromkeys(warnings))
+    return {"warnings": texts, "warning_weights": [weight_of(text) for text in texts]}
 
 
 def describe_cameras(records: Mapping[str, FrameRecord]) -> dict[str, dict[str, float]]:
@@ -488,13 +497,12 @@ def frame_warnings(records: Mapping[str, FrameRecord]) -> tuple[str, ...]:
     Frames without a pose of the method person are not named.
     """
     found: dict[str, list[str]] = {}
-    limits = {"run_limit": "run limit", "time_limit": "time limit; raise it (time_limit)"}
     for frame, record in records.items():
         # The method person explains frames without a pose itself.
         if not record.found and record.inlier_ratio is None:
             found.setdefault("no pose was found; check masks and pictures", []).append(frame)
-        elif record.found and record.stopped_by in limits:
-            text = f"the search was stopped by the {limits[record.stopped_by]}"
+        elif record.found and record.stopped_by == "run_limit":
+            text = "the search was stopped by its limit of runs"
             found.setdefault(text, []).append(frame)
     known = list(records)
     return tuple(
@@ -539,9 +547,12 @@ def poor_fit_warnings(
     if names := ", ".join(held):
         advice.append(f"the held positions ({names})")
     return (
-        f"frame {frame_ranges(bad, list(records))} ({several}E_total {error}): the pose fits the "
-        "pictures badly and may be wrong; check the overlays, the masks, "
-        f"{', '.join(advice)} and the position of the root",
+        weighted(
+            f"frame {frame_ranges(bad, list(records))} ({several}E_total {error}): the pose fits "
+            "the pictures badly and may be wrong; check the overlays, the masks, "
+            f"{', '.join(advice)} and the position of the root",
+            "wrong",
+        ),
     )
 
 

@@ -15,7 +15,7 @@ from pydrake.geometry import (
     SourceId,
 )
 from pydrake.math import RigidTransform, RotationMatrix
-from pydrake.systems.framework import Diagram, DiagramBuilder
+from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 
 from drake_pose.body import ArticulatedModel
@@ -79,48 +79,10 @@ def make_replay(
         p_OC_W = -cameras[0].X_WC[:3, 2]
     beside = RotationMatrix.MakeZRotation(np.radians(20.0)).multiply(p_OC_W)
     meshcat.SetCameraPose(p_WO + 1.7 * radius * beside / np.linalg.norm(beside), p_WO)
-    _record(meshcat, builder.Build(), source, positions, X_WB, period, model, measured)
-    return meshcat.StaticHtml()
-
-
-def _lighten(scene_graph: SceneGraph, source: SourceId, most: int) -> None:
-    """Simplify illustration meshes of a scene graph to at most ``most`` triangles in all.
-
-    ``source`` is the geometry source of the meshes, such as a plant's; others stay unchanged.
-    """
-    inspector = scene_graph.model_inspector()
-    shown = {
-        one: shape
-        for one in inspector.GetAllGeometryIds(Role.kIllustration)
-        if inspector.BelongsToSource(one, source)
-        and isinstance(shape := inspector.GetShape(one), Mesh)
-    }
-    meshes = [shape_mesh(one) for one in shown.values()]
-    for one, mesh, light in zip(shown, meshes, reduce_meshes(meshes, most), strict=True):
-        if light is not mesh:
-            scene_graph.ChangeShape(source, one, Mesh(write_obj(light, "replay")))
-
-
-def _record(
-    meshcat: Meshcat,
-    diagram: Diagram,
-    source: ConstantVectorSource,
-    positions: np.ndarray,
-    X_WB: np.ndarray,
-    period: float,
-    model: ArticulatedModel,
-    measured: np.ndarray | None,
-) -> None:
-    """Record the animation of all frames, and publish it to Meshcat.
-
-    Frame k is at k times ``period``; from a period of 1 s on it is repeated just before the next
-    frame. positions, X_WB, period, model and measured are as in `make_replay`.
-
-    ``meshcat``: the page. ``diagram``: diagram that publishes the body to the page. ``source``: the
-    diagram's source of positions (nq,).
-    """
+    diagram = builder.Build()
     context = diagram.CreateDefaultContext()
     value = source.get_mutable_source_value(source.GetMyMutableContextFromRoot(context))
+    # From a period of 1 s on, a frame is repeated just before the next one.
     still = period >= 1.0
     offsets = (0.0, 0.9 * period) if still else (0.0,)
     meshcat.StartRecording(frames_per_second=10.0 / period if still else 1.0 / period)
@@ -141,6 +103,25 @@ def _record(
                 meshcat.SetTransform(path, pose, time)
     meshcat.StopRecording()
     meshcat.PublishRecording()
+    return meshcat.StaticHtml()
+
+
+def _lighten(scene_graph: SceneGraph, source: SourceId, most: int) -> None:
+    """Simplify illustration meshes of a scene graph to at most ``most`` triangles in all.
+
+    ``source`` is the geometry source of the meshes, such as a plant's; others stay unchanged.
+    """
+    inspector = scene_graph.model_inspector()
+    shown = {
+        one: shape
+        for one in inspector.GetAllGeometryIds(Role.kIllustration)
+        if inspector.BelongsToSource(one, source)
+        and isinstance(shape := inspector.GetShape(one), Mesh)
+    }
+    meshes = [shape_mesh(one) for one in shown.values()]
+    for one, mesh, light in zip(shown, meshes, reduce_meshes(meshes, most), strict=True):
+        if light is not mesh:
+            scene_graph.ChangeShape(source, one, Mesh(write_obj(light, "replay")))
 
 
 def _extent(

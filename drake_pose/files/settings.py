@@ -190,8 +190,9 @@ def parse_root_rotation(text: str) -> RootTurns:
 
 
 def percent(fraction: float | None) -> str:
-    """Return a fraction in percent with two decimals, or a dash for None."""
-    return "-" if fraction is None else f"{100.0 * fraction:.2f} %"
+    """Return a fraction in percent with two decimals; "unknown" for None or nan."""
+    is_known = fraction is not None and fraction == fraction  # Only nan differs from itself.
+    return f"{100.0 * fraction:.2f} %" if fraction is not None and is_known else "unknown"
 
 
 def documented(cls: _Settings) -> _Settings:
@@ -292,7 +293,7 @@ class CaptureSettings(SceneSettings):
 
     Args:
         track: Track the body through a sequence, and search only in the first frame and after a
-            loss; --no-track: search in every frame.
+            loss (default); --no-track: search in every frame.
     """
 
     track: Annotated[bool, Parameter(negative="--no-track"), SELECTION] = True
@@ -430,7 +431,7 @@ class MaskSettings:
         episode: Number of the episode in a LeRobot data set. Default: the only one.
     """
 
-    background: str | Path | None = None
+    background: Annotated[str | Path | None, Parameter(metavar="PICTURE")] = None
     classes: Annotated[Names, Parameter("--class")] = ()
     largest: bool = False
     cameras: Path | None = None

@@ -24,15 +24,14 @@ from drake_pose.files.folder import (
     JOINTS,
     MODES,
     MOT,
-    OVERLAY,
     REPLAY,
-    REPORT,
     TRC,
     without_nan,
     write_file,
     write_summary,
 )
-from drake_pose.files.overlay import draw_overlay, encode_png
+from drake_pose.files.overlay import encode_png
+from drake_pose.files.page import estimate_page
 from drake_pose.files.records import (
     BASE_COLUMNS,
     FrameRecord,
@@ -52,7 +51,6 @@ from drake_pose.files.records import (
     user_units,
 )
 from drake_pose.files.replay import make_replay
-from drake_pose.files.report_page import make_report
 from drake_pose.input_files import csv_text
 from drake_pose.silhouette.pictures.scene_checks import frame_ranges
 from drake_pose.silhouette.pictures.scenes import USUAL_RATE_HZ, Scene
@@ -64,9 +62,8 @@ name and record; once before the first frame, with "" and None."""
 OnStage = Callable[[str, int, int | None], None]
 """Called with the name of a stage, the work done, and all its work (None if unknown)."""
 
-Drawn = Mapping[str, tuple[np.ndarray, np.ndarray | None]]
-"""Content of overlays by camera: a mask (H, W) or picture (H, W, 3), and the index of the body's
-node at each pixel (H, W), -1 outside the body; None if no pose was found."""
+Drawn = Mapping[str, np.ndarray]
+"""Pictures of a frame, as `encode_png` takes them, by their paths in the result folder."""
 
 
 class ResultWriter:
@@ -146,29 +143,21 @@ class ResultWriter:
         self,
         frames: Iterable[tuple[FrameRecord, Drawn]],
         asked: Collection[str],
-        on_frame: OnFrame | None,
+        on_frame: OnFrame,
     ) -> None:
         """Write each frame, with its overlays, as soon as it is estimated.
 
-        ``frames``: records and overlay contents, in order. ``asked``: names of all frames to be
+        ``frames``: records and pictures, in order. ``asked``: names of all frames to be
         estimated, those that are finished included. ``on_frame``: called before the first and after
-        each frame; None: not called.
+        each frame.
         """
         finished = sum(frame in self.records for frame in asked)
-        if on_frame is not None:
-            on_frame(finished, len(asked), "", None)
+        on_frame(finished, len(asked), "", None)
         for count, (record, drawn) in enumerate(frames, finished + 1):
-            fit = "no pose found"
-            if record.E_total is not None:
-                fit = f"E_total {100.0 * record.E_total:.1f} %"
-            for camera, (seen, parts) in drawn.items() if self.folder is not None else ():
-                body = np.zeros(seen.shape[:2], np.bool_) if parts is None else parts >= 0
-                title = f"{camera}  frame {record.frame}  {fit}"
-                picture = encode_png(draw_overlay(seen, body, parts, title))
-                self.write(f"{OVERLAY}/{camera}/{record.frame}.png", picture)
+            for name, picture in drawn.items() if self.folder is not None else ():
+                self.write(name, encode_png(picture))
             self.add(record)
-            if on_frame is not None:
-                on_frame(count, len(asked), record.frame, self.records[record.frame])
+            on_frame(count, len(asked), record.frame, self.records[record.frame])
 
     def add(self, record: FrameRecord) -> None:
         """Append a frame's row to poses.csv, which marks it as finished; renew an old summary."""
@@ -207,8 +196,9 @@ class ResultWriter:
             found = [record for record in records.values() if record.found]
             if replay and found:
                 self.write(REPLAY, self._replay(found, 1.0 / (rate or 1.0)))
-            page = make_report(self.folder, self.model, self.scene, self.result())
-            self.write(REPORT, page)
+            self.write_summary()
+            page = estimate_page(self.folder, self.model, self.scene, self.result())
+            page.write(self.folder)
         self._complete = True
 
     def _replay(self, found: Sequence[FrameRecord], period: float) -> str:
@@ -240,12 +230,12 @@ class ResultWriter:
     def result(self) -> SceneEstimate:
         """Return the estimate so far, in the scene's order, including frames of an earlier job."""
         records = self._in_order()
-        more = {**self.more, "warnings": self.warnings}
+        more = dict(self.more)
         if self.scene.frame_rate_hz is not None:
             more["frame_rate_hz"] = self.scene.frame_rate_hz
         return SceneEstimate(
             self.model.position_names, self.model.position_kinds, records,
-            without_nan(summarize(self._job, records, self._complete, more)),
+            without_nan(summarize(self._job, records, self._complete, more, self.warnings)),
             self.folder, tuple(self.warnings),
         )  # fmt: skip
 

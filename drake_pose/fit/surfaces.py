@@ -274,7 +274,19 @@ def load_or_make(
     if outline is None:
         outline = make()
         with suppress(OSError):  # The disk is full or the folder is not writable.
-            _write(path, outline)
+            buffer = io.BytesIO()
+            np.savez(buffer, vertices=outline.vertices, triangles=outline.triangles)
+            payload = buffer.getvalue()
+            path.parent.mkdir(exist_ok=True)
+            # Processes that store the same surface do not interfere.
+            part_file = path.with_suffix(f".{os.getpid()}.{time.monotonic_ns()}.part")
+            try:
+                part_file.write_bytes(hashlib.sha256(payload).digest() + payload)
+                part_file.replace(path)
+            except OSError:
+                with suppress(OSError):
+                    part_file.unlink()
+                raise
             ages = sorted(
                 (one.stat().st_mtime, one) for one in path.parent.iterdir() if one.is_file()
             )
@@ -298,22 +310,3 @@ def _read(path: Path) -> Outline | None:
     with suppress(OSError):
         os.utime(path)
     return outline
-
-
-def _write(path: Path, outline: Outline) -> None:
-    """Store a surface atomically, so that processes storing the same one do not interfere.
-
-    Raises OSError: the file cannot be written.
-    """
-    buffer = io.BytesIO()
-    np.savez(buffer, vertices=outline.vertices, triangles=outline.triangles)
-    payload = buffer.getvalue()
-    path.parent.mkdir(exist_ok=True)
-    part = path.with_suffix(f".{os.getpid()}.{time.monotonic_ns()}.part")
-    try:
-        part.write_bytes(hashlib.sha256(payload).digest() + payload)
-        part.replace(path)
-    except OSError:
-        with suppress(OSError):
-            part.unlink()
-        raise

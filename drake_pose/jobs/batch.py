@@ -32,7 +32,7 @@ from drake_pose.jobs.batch_tasks import (
     plan_scene,
 )
 from drake_pose.jobs.cluster import address_of, call_in_child
-from drake_pose.jobs.episodes_table import episodes_table
+from drake_pose.jobs.episodes_table import batch_page, episodes_table
 from drake_pose.version import VERSION
 
 if TYPE_CHECKING:
@@ -185,13 +185,11 @@ class Batch:
         }
 
     def write(self) -> None:
-        """Write batch.json; for audits also findings.csv, episodes.csv and camera files.
+        """Write batch.json and report.html; for audits also tables and camera files.
 
         Raises OutputError: a file cannot be written.
         """
         self.seconds = time.monotonic() - self._begin
-        text = json.dumps(without_nan(self.as_json()), indent=2, ensure_ascii=False)
-        write_file(self.out, "batch.json", text + "\n")
         if any(state.job.audit is not None for state in self.scenes.values()):
             rows = [
                 (name, one["what"], one["name"], one["text"])
@@ -202,12 +200,17 @@ class Batch:
                 self.out, "findings.csv", csv_text([("scene", "what", "name", "text"), *rows])
             )
         found = {name: one.totals for name, one in self.scenes.items()}
-        files, self.moves = episodes_table(found, is_drawn=not self.waiting)
+        files, self.moves = episodes_table(found)
         for name, content in files.items():
             write_file(self.out, name, content)
         for path in self.out.glob("cameras_*.yaml") if files else ():
             if path.name not in files:
                 path.unlink()
+        content = without_nan(self.as_json())
+        text = json.dumps(content, indent=2, ensure_ascii=False)
+        write_file(self.out, "batch.json", text + "\n")
+        if not self.waiting and self.scenes:
+            batch_page(self.out, content, found).write(self.out)
 
     def plan(self) -> None:
         """Queue all scenes' tasks that have no result yet; scenes that cannot be read fail.
@@ -285,7 +288,8 @@ class Batch:
         state.seconds += outcome.seconds
         self.waiting.extend(self._followers.pop(task.job.name, ()))
         if outcome.error is not None:
-            self._fail(state, task.extent, outcome.error)
+            extent = "" if task.index is None else f"frames {task.frames[0]} to {task.frames[-1]}"
+            self._fail(state, extent, outcome.error)
         elif task.index is not None:
             state.done.add(task.index)
             if len(state.done) == len(state.tasks):
@@ -316,7 +320,7 @@ class Batch:
         """Record an error of a task of a scene.
 
         The scene's other tasks are dropped if the whole scene or ``most`` of its chunks failed.
-        ``extent`` is the task's `Task.extent`.
+        ``extent`` is the task's range of frames in words; "" for the whole scene.
         """
         state.errors.setdefault(error, []).append(extent)
         if not extent or sum(map(len, state.errors.values())) >= most:

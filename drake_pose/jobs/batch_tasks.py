@@ -23,13 +23,21 @@ from drake_pose.body import landmarks_file, load_model
 from drake_pose.camera.camera_files import intrinsics_of, load_cameras
 from drake_pose.camera.episode_files import open_episode
 from drake_pose.errors import DrakePoseError, OutputError, SettingsError, for_caller, messages_for
-from drake_pose.files.folder import OVERLAY, POSES, read_summary, write_file, write_summary
+from drake_pose.files.folder import (
+    OVERLAY,
+    OVERLAY_MODES,
+    POSES,
+    read_summary,
+    write_file,
+    write_summary,
+)
 from drake_pose.files.records import FrameRecord, describe_job, file_digest, mask_digests, summarize
 from drake_pose.files.settings import (
     AuditSettings,
     EpisodeSettings,
     EstimateSettings,
     FromText,
+    plain,
     say_gone,
 )
 from drake_pose.input_files import named_fields, read_yaml
@@ -62,9 +70,8 @@ class SceneJob:
 
     def describe(self) -> dict[str, Any]:
         """Return plain JSON values, equal only if a resumed job is unchanged."""
-        truth = None if self.truth is None else str(self.truth)
         described = describe_job(self.scene, self.model, self.settings)
-        described |= {"chunk": self.chunk, "truth": truth}
+        described |= {"chunk": self.chunk, "truth": plain(self.truth)}
         if self.audit is not None:
             for name, file in (("audit", self.audit), ("camera_file", self.camera_file)):
                 described[name] = file
@@ -240,11 +247,6 @@ class Task:
     near: Path | None = None
 
     @property
-    def extent(self) -> str:
-        """The range of frames, for messages; "" for the whole scene."""
-        return "" if self.index is None else f"frames {self.frames[0]} to {self.frames[-1]}"
-
-    @property
     def work(self) -> Path:
         """Folder of the scene's finished chunks, removed when the scene is finished."""
         return self.out / ".chunks" / self.job.name
@@ -414,8 +416,9 @@ def _join_chunks(task: Task, settings: EstimateSettings, part: Path) -> None:
         header, *lines = (chunk / POSES).read_text(encoding="utf-8").splitlines(keepends=True)
         rows += lines
         records.update(read_summary(chunk)["frames"])
-        if (chunk / OVERLAY).is_dir():
-            shutil.copytree(chunk / OVERLAY, part / OVERLAY, copy_function=link, dirs_exist_ok=True)
+        for name in (OVERLAY, OVERLAY_MODES):
+            if (chunk / name).is_dir():
+                shutil.copytree(chunk / name, part / name, copy_function=link, dirs_exist_ok=True)
     write_file(part, POSES, "".join([header, *rows]))
     described = describe_job(task.job.scene, task.job.model, settings)
     known = {
@@ -440,7 +443,8 @@ def _totals(task: Task) -> Mapping[str, Any] | None:
     found = summary["findings"]
     off = {one["name"]: one for one in found if one["what"] == "camera"}
     cameras = {
-        name: one
+        name: {"X_WC": one.get("X_LC")}
+        | one
         | {"off_mm": off.get(name, {}).get("shift_mm")}
         | {"off_deg": off.get(name, {}).get("angle_deg")}
         for name, one in summary["found_cameras"].items()

@@ -1,11 +1,12 @@
 """The demonstration: joint angles of a real person from one silhouette."""
 
 import json
+import shutil
 from pathlib import Path
 
 from drake_pose.body import bundled_model
 from drake_pose.errors import OutputError, SceneError
-from drake_pose.files.folder import OVERLAY, RESULT_FILES, SUMMARY, claimed
+from drake_pose.files.folder import OVERLAY, OVERLAY_MODES, RESULT_FILES, SUMMARY, claimed
 from drake_pose.files.records import SceneEstimate
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.files.writer import OnFrame
@@ -39,11 +40,11 @@ def demo_settings(scene: Path) -> EstimateSettings:
     )
 
 
-def run_demo(out: Path, on_frame: OnFrame | None = None) -> SceneEstimate:
+def run_demo(out: Path, on_frame: OnFrame = lambda *_: None) -> SceneEstimate:
     """Estimate the demonstration's scene.
 
     ``out``: folder for the result; the result of an earlier demonstration is replaced.
-    ``on_frame``: called before and after the only frame; None: not called. Raises OutputError: the
+    ``on_frame``: called before and after the only frame. Raises OutputError: the
     folder holds other files.
     """
     scene = stored_scene("human")
@@ -53,14 +54,13 @@ def run_demo(out: Path, on_frame: OnFrame | None = None) -> SceneEstimate:
             is_demo = Path(summary["scene"]).resolve() == scene.resolve()
         except (OSError, ValueError, TypeError, KeyError):
             is_demo = False
-        if is_demo and {file.name for file in out.iterdir()} <= {*RESULT_FILES, OVERLAY}:
-            overlay = out / OVERLAY
-            try:
-                for file in (*(out / name for name in RESULT_FILES), *overlay.glob("*/*.png")):
-                    file.unlink(missing_ok=True)
-                for folder in (*overlay.glob("*"), *out.glob(OVERLAY)):
-                    folder.rmdir()
-            except OSError as error:
-                text = f"{error.filename}: cannot be removed: {error.strerror}"
-                raise OutputError(text) from error
+        known = {*RESULT_FILES, OVERLAY, OVERLAY_MODES}
+        own = [*out.iterdir()] if is_demo else []
+        pictures = [one for one in out.rglob("*/*") if one.is_file()]
+        if {one.name for one in own} <= known and all(one.suffix == ".png" for one in pictures):
+            for file in own:
+                try:
+                    shutil.rmtree(file) if file.is_dir() else file.unlink()
+                except OSError as error:
+                    raise OutputError(f"{file}: cannot be removed: {error.strerror}") from error
     return estimate_scene(scene, bundled_model("man"), out, demo_settings(scene), on_frame=on_frame)

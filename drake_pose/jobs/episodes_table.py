@@ -1,24 +1,36 @@
-"""Table of the cameras of all audited episodes, the poses that they share, and their files."""
+"""The page of a batch; and the cameras of its audited episodes, and the poses that they share."""
 
-import io
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
+from markupsafe import Markup
 from scipy.spatial.transform import Rotation
 from scipy.special import chdtrc
 
 from drake_pose.arrays import Array
 from drake_pose.errors import listed
+from drake_pose.files.page import (
+    BLUE,
+    NORMAL,
+    Figure,
+    Page,
+    Table,
+    bad,
+    p_value,
+    plot,
+    share,
+)
 from drake_pose.input_files import csv_text
 from drake_pose.registration.diagnosis import DIAGNOSIS
 from drake_pose.registration.online_registration import pose_difference, squared_distance
 
 FoundCamera = Mapping[str, Any]
 """A camera found by an audit, as in ``found_cameras`` of its summary.json; keys used here: X_WC (4,
-4), covariance (6, 6; rotation first, rad and m), translation_sd_mm, focal_sd_px (None if not
-estimated) and camera (its entry of a camera file)."""
+4; of a camera on a link X_LC), covariance (6, 6; rotation first, rad and m), translation_sd_mm,
+focal_sd_px (None if not estimated) and camera (its entry of a camera file)."""
 
 COLUMNS = (
     "scene", "camera", "frames", "agreeing", "x", "y", "z", "sd_mm", "sd_deg", "off_mm", "off_deg",
@@ -33,20 +45,19 @@ camera_file: file with the cameras' poses, combined from all episodes that share
 
 
 def episodes_table(
-    episodes: Mapping[str, Mapping[str, Any]], is_drawn: bool = False
-) -> tuple[dict[str, str | bytes], tuple[str, ...]]:
+    episodes: Mapping[str, Mapping[str, Any]],
+) -> tuple[dict[str, str], tuple[str, ...]]:
     """Return files about audited episodes by name, and which cameras moved.
 
-    The files are episodes.csv, camera files, and of two episodes or more episodes.png, displacement
-    and joint offsets over the episodes; {} without audited episodes. Sentences say for each camera
-    which episodes share a pose and since when it has moved.
+    The files are episodes.csv and camera files; {} without audited episodes. Sentences say for each
+    camera which episodes share a pose and since when it has moved.
 
     An episode shares the pose of the episode before unless it differs significantly from all
     episodes with that pose combined; else the most likely of the poses before; else it has a new
     one. A new camera file begins at each episode in which a camera has moved.
 
     ``episodes``: totals of audits (`batch.Outcome`) by scene, in the order of the job; scenes
-    without ``cameras`` are skipped. ``is_drawn``: whether the picture is drawn.
+    without ``cameras`` are skipped.
     """
     rows = list[list[Any]]()
     poses, files = dict[str, list[_CombinedPose]](), list[dict[str, _CombinedPose]]([{}])
@@ -57,7 +68,14 @@ def episodes_table(
         moves = dict[str, tuple[Any, ...]]()
         for name, one in found.items():
             own, last = poses.setdefault(name, []), before.get(name)
-            shared, p_value = _shared_pose(one, own, last)
+            shared: _CombinedPose | None = None
+            p_value: float | None = None
+            if last is not None:
+                in_order = [last, *(k for k in own if k is not last)]
+                p_values = [k.compare(one)[2] for k in in_order]
+                best = 0 if p_values[0] >= DIAGNOSIS.significance else int(np.argmax(p_values))
+                p_value = p_values[best]
+                shared = in_order[best] if p_value >= DIAGNOSIS.significance else None
             if shared is None:
                 own.append(shared := _CombinedPose(one))
             shift, turn = (None, None) if last is None else last.compare(one)[:2]
@@ -79,30 +97,46 @@ def episodes_table(
             )  # fmt: skip
     if not rows:
         return {}, ()
-    made: dict[str, str | bytes] = {"episodes.csv": csv_text([COLUMNS, *rows])}
+    made = {"episodes.csv": csv_text([COLUMNS, *rows])}
     for k, file in enumerate(files, 1):
         entries = {name: one.entry() for name, one in file.items()}
         made[f"cameras_{k}.yaml"] = yaml.safe_dump(entries)
-    if is_drawn and len({row[0] for row in rows}) > 1:
-        moved = {row[0] for row in rows if row[COLUMNS.index("moved")] == "yes"}
-        made["episodes.png"] = _draw(episodes, moved)
     return made, _describe_moves(rows)
 
 
-def _shared_pose(
-    one: FoundCamera, poses: Sequence["_CombinedPose"], last: "_CombinedPose | None"
-) -> tuple["_CombinedPose | None", float | None]:
-    """Return the pose that a camera shares, and its distance's p-value; None: a new one.
+def batch_page(
+    folder: Path, content: Mapping[str, Any], episodes: Mapping[str, Mapping[str, Any]]
+) -> Page:
+    """Return the page of a finished batch.
 
-    ``poses``: its poses in earlier episodes. ``last``: the previous episode's, if any.
+    ``folder``: the batch's folder, with its files. ``content``: that of batch.json. ``episodes``:
+    totals (`batch.Outcome`) by scene.
     """
-    if last is None:
-        return None, None
-    in_order = [last, *(k for k in poses if k is not last)]
-    p_values = [k.compare(one)[2] for k in in_order]
-    best = 0 if p_values[0] >= DIAGNOSIS.significance else int(np.argmax(p_values))
-    is_shared = p_values[best] >= DIAGNOSIS.significance
-    return (in_order[best] if is_shared else None), p_values[best]
+    scenes: Mapping[str, Mapping[str, Any]] = content["scenes"]
+    rows, named = list[list[str]](), dict[str, list[str]]()
+    for name, one in scenes.items():
+        errors = [f"{error['what']} {error['name']}" for error in one.get("findings") or ()]
+        for error in errors:
+            named.setdefault(error, []).append(name)
+        good = one.get("agreeing_count") if "findings" in one else one.get("found_count")
+        told = bad(listed(errors)) if errors else "no error found"
+        if "findings" not in one:
+            told = f"E_total {share(one['mean_E_total'], 'unknown')}"
+        if failed := [error["error"] for error in one["errors"]]:
+            told = bad("; ".join(failed))
+        link = Markup('<a href="{0}/report.html">{0}</a>').format(name) if good else name
+        rows.append([link, one["state"], f"{good or 0} of {one['frame_count']}", told])
+    finished = sum(one["state"] == "finished" for one in scenes.values())
+    good = "consistent" if any("findings" in one for one in scenes.values()) else "with a pose"
+    texts = [f"{finished} of {len(scenes)} scenes finished."]
+    texts += [f"In {len(of)} of them: {error}." for error, of in list(named.items())[:3]]
+    moves = [f"{text[0].upper()}{text[1:]}." for text in content["moves"][:4]]
+    return Page(
+        folder.name, f"Batch of {len(scenes)} scenes", " ".join((*texts, *moves)), {}, {
+            "Scenes": [Table(["scene", "state", f"frames {good}", "result"], rows)],
+            "episodes": [_displacements(episodes)],
+        }, ["Open a scene's page by its name below."],
+    )  # fmt: skip
 
 
 def _describe_moves(rows: Sequence[Sequence[Any]]) -> tuple[str, ...]:
@@ -120,7 +154,7 @@ def _describe_moves(rows: Sequence[Sequence[Any]]) -> tuple[str, ...]:
                 shift, turn = (row[columns[key]] for key in ("moved_mm", "moved_deg"))
                 sentences.append(
                     f"camera '{camera}' moved by {turn:.2f} degrees and {shift:.1f} mm before "
-                    f"episode {row[0]} (p-value {row[columns['p_value']]:.1g})"
+                    f"episode {row[0]} (p-value {p_value(row[columns['p_value']])})"
                     if row[columns["pose"]] == max(numbers[: own.index(row) + 1])
                     and row[columns["pose"]] not in numbers[: own.index(row)]
                     else f"camera '{camera}' moved back to pose {row[columns['pose']]} by "
@@ -132,50 +166,34 @@ def _describe_moves(rows: Sequence[Sequence[Any]]) -> tuple[str, ...]:
     return tuple(sentences)
 
 
-def _draw(
-    episodes: Mapping[str, Mapping[str, Any]], moved: Collection[str], normal: float = 1.96
-) -> bytes:
-    """Return a picture (PNG) of the cameras' displacements and joint offsets over the episodes.
+def _displacements(episodes: Mapping[str, Mapping[str, Any]]) -> list[Figure]:
+    """Return plots of the cameras' displacements and joint offsets over the episodes.
 
-    Displacements are those from the first episode; bars are 95 % intervals.
-
-    ``episodes``: totals by scene. ``moved``: names of the scenes before which a camera has moved,
-    which get a line. ``normal``: half the width of a 95 % interval in standard deviations.
+    Displacements are those from the first episode. ``episodes``: totals by scene.
     """
     scenes = [name for name, totals in episodes.items() if totals.get("cameras")]
-    curves = dict[tuple[str, str], list[tuple[int, float, float]]]()
-    first = dict[str, Array]()
+    ends, first = dict[str, Array](), dict[str, Array]()
     for k, scene in enumerate(scenes):
+        found = dict[str, tuple[float, float]]()
         for name, one in episodes[scene]["cameras"].items():
             X_WC = np.array(one["X_WC"])
             off = pose_difference(X_WC, first.setdefault(name, X_WC))
-            size = float(1e3 * np.linalg.norm(off[3:]))
-            turn = float(np.degrees(np.linalg.norm(off[:3])))
-            curves.setdefault(("shift [mm]", name), []).append((k, size, one["translation_sd_mm"]))
-            curves.setdefault(("turn [deg]", name), []).append((k, turn, one["rotation_sd_deg"]))
+            turn, shift = np.degrees(np.linalg.norm(off[:3])), 1e3 * np.linalg.norm(off[3:])
+            found[f"{name}: shift [mm]"] = float(shift), one["translation_sd_mm"]
+            found[f"{name}: turn [deg]"] = float(turn), one["rotation_sd_deg"]
         for name, (unit, value, sd) in episodes[scene].get("joint_offsets", {}).items():
-            curves.setdefault((f"joint offset [{unit}]", name), []).append((k, value, sd))
-    titles = list(dict.fromkeys(title for title, _ in curves))
-    from matplotlib.figure import Figure  # Slow to import, and few jobs draw.
-
-    figure = Figure(figsize=(8.0, 0.4 + 1.9 * len(titles)), dpi=120, layout="constrained")
-    figure.suptitle("Difference from the first episode; dashed: a camera moved", fontsize=9)
-    for axes, title in zip(np.atleast_1d(figure.subplots(len(titles), 1)), titles, strict=True):
-        for (kind, name), points in curves.items():
-            if kind == title:
-                x, y, sd = np.array(points).T
-                axes.errorbar(x, y, normal * sd, fmt="o-", markersize=3, linewidth=0.8, label=name)
-        for scene in moved:
-            axes.axvline(scenes.index(scene) - 0.5, color="#d55e00", linestyle="--", linewidth=1.0)
-        axes.set_ylabel(title, fontsize=8)
-        axes.tick_params(labelsize=7)
-        axes.legend(fontsize=7, loc="upper left")
-        step = max(1, len(scenes) // 12)
-        axes.set_xlim(-0.5, len(scenes) - 0.5)
-        axes.set_xticks(range(0, len(scenes), step), scenes[::step])
-    stream = io.BytesIO()
-    figure.savefig(stream, format="png")
-    return stream.getvalue()
+            found[f"{name}: joint offset [{unit}]"] = value, sd
+        for title, (value, sd) in found.items():
+            own = ends.setdefault(title, np.full((len(scenes), 3), np.nan))
+            own[k] = value + NORMAL * sd * np.array([-1.0, 0.0, 1.0])
+    return [
+        (
+            plot([("estimate", y)], scenes, title, bands=[(BLUE, low, high)], joined=False),
+            "Blue: 95 % interval.", title,
+        )
+        for title, (low, y, high) in ((title, own.T) for title, own in ends.items())
+        if len(scenes) > 1
+    ]  # fmt: skip
 
 
 class _CombinedPose:
@@ -227,4 +245,5 @@ class _CombinedPose:
         deviation, since estimated focal length and distance are correlated.
         """
         own: dict[str, Any] = self._surest["camera"]
-        return own if self._is_focal else own | {"X_WC": self.pose()[0].tolist()}
+        name = "X_LC" if "link" in own else "X_WC"
+        return own if self._is_focal else own | {name: self.pose()[0].tolist()}

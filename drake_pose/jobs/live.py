@@ -9,7 +9,7 @@ import os
 import time
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack, closing
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import cv2
@@ -112,16 +112,10 @@ def load_live_scene(path: Path) -> LiveScene:
 
     Raises SceneError, CameraError: the message names a missing or damaged file.
     """
-    if not path.is_dir():
-        raise SceneError(f"{path}: no such folder; it needs {CAMERAS} and {SOURCES}")
-    if not (path / SOURCES).is_file():
-        raise SceneError(
-            f"{path}: has no {SOURCES}, which names the sources of its cameras' pictures"
-        )
+    specifications = load_sources(path / SOURCES)
     cameras = load_cameras(path / CAMERAS)
     if len(cameras) < 2:
         raise SceneError(f"{path}: the capture of a person needs two or more calibrated cameras")
-    specifications = load_sources(path / SOURCES, cameras)
     filmed = {name: one for name, one in specifications.items() if not one.gives_masks}
     backgrounds = {k: learn_background(load_background_pictures(one)) for k, one in filmed.items()}
     return LiveScene(path, cameras, specifications, backgrounds)
@@ -395,24 +389,21 @@ def find_registered_pose(
     ring = {name: one for name, one in cameras.items() if name != face}
     blank = CaptureSetup(load_skeleton(model), ring, backgrounds=scene.backgrounds)
     best, shown = _best_registered_frame(blank, ring, scene.open_sensors(), on_report)
-    if best is None:
+    if best is None or best[1] < blank.recognition:
+        seen = "two cameras never saw a whole person at the same time"
+        if best is not None:
+            seen = f"the best similarity is {best[1]:.2f}, {blank.recognition:.2f} are needed"
         raise SettingsError(
-            f"{path}: two cameras never saw a whole person at the same time; compare the pictures "
-            "with those of the empty room"
-        )
-    (q, similarity), needed = best, blank.recognition
-    if similarity < needed:
-        raise SettingsError(
-            f"{path}: no frame shows the registered pose, upright with both arms spread: the best "
-            f"similarity is {similarity:.2f}, {needed:.2f} are needed; show the pose once, give a "
-            "model with the person's measures (urdf/person/make_person.py makes one), or use "
-            "--method person"
+            f"{path}: no frame shows the registered pose, upright with both arms spread: {seen}; "
+            "compare the pictures with those of the empty room, show the pose once, give a model "
+            "with the person's measures (urdf/person/make_person.py makes one), or use --method "
+            "person"
         )
     known = {name: one for name, one in cameras.items() if name == face or name in shown}
     for name in cameras:
         if name not in known:
             on_report(f"camera '{name}' has no picture of the registered pose and is left out")
-    return prepare_paper_capture(model, known, face, q, shown, scene.backgrounds, faces=faces)
+    return prepare_paper_capture(model, known, face, best[0], shown, scene.backgrounds, faces=faces)
 
 
 def _best_registered_frame(
@@ -439,29 +430,24 @@ def _best_registered_frame(
     def look(context: Context) -> bool:
         """Compare a new frame with the registered pose; return whether the best one is final."""
         nonlocal registered, best, shown, since
-        if evaluate(sensors.GetOutputPort("fresh"), context)[0]:
-            since += 1
-            views = {
-                name: view
-                for name in ring
-                if (view := diagram.GetOutputPort(f"person_view_{name}").Eval(context)) is not None
-            }
-            contours = {name: one.contour for name, one in views.items() if one.contour is not None}
-            cameras, outlines = [ring[name] for name in contours], list(contours.values())
-            if len(outlines) >= 2:
-                if registered is None:
-                    q = place_registered(
-                        setup.skeleton, cameras, [middle for _, middle in outlines]
-                    )
-                    registered = render_registered_pose(setup.skeleton, q, ring)
-                found = recognise(setup.skeleton, registered, cameras, outlines, threshold=0.0)
-                if found is not None and (best is None or found[1] > best[1]):
-                    best, since = found, 0
-                    ports = {name: sensors.GetOutputPort(f"color_image_{name}") for name in views}
-                    images = {name: evaluate(port, context) for name, port in ports.items()}
-                    shown = {k: colour_image_to_picture(one).copy() for k, one in images.items()}
-        is_sure = best is not None and best[1] >= setup.recognition
-        return is_sure and since >= more_frames
+        if not evaluate(sensors.GetOutputPort("fresh"), context)[0]:
+            return False
+        since += 1
+        views = {n: diagram.GetOutputPort(f"person_view_{n}").Eval(context) for n in ring}
+        contours = {n: one.contour for n, one in views.items() if one is not None}
+        outlines = {n: one for n, one in contours.items() if one is not None}
+        if len(outlines) >= 2:
+            cameras, seen = [ring[name] for name in outlines], list(outlines.values())
+            if registered is None:
+                q = place_registered(setup.skeleton, cameras, [middle for _, middle in seen])
+                registered = render_registered_pose(setup.skeleton, q, ring)
+            found = recognise(setup.skeleton, registered, cameras, seen, threshold=0.0)
+            if found is not None and (best is None or found[1] > best[1]):
+                best, since = found, 0
+                ports = {name: sensors.GetOutputPort(f"color_image_{name}") for name in contours}
+                images = {name: evaluate(port, context) for name, port in ports.items()}
+                shown = {k: colour_image_to_picture(one).copy() for k, one in images.items()}
+        return best is not None and best[1] >= setup.recognition and since >= more_frames
 
     look_until(diagram, sensors, look, on_report)
     return best, shown
@@ -556,15 +542,12 @@ class _FrameWriter:
         writer, sources, warnings = self.writer, {}, []
         for name, count in sensors.counts().items():
             given = self.scene.specifications[name]
-            what = {True: "stopped", False: "returned"}
-            changes = [{"time": one.time, "what": what[one.stopped]} for one in count.changes]
-            known = {"kind": given.kind, "location": given.location, **asdict(count)}
-            sources[name] = known | {"changes": changes}
-            numbers = {"could not be used": count.dropped, "came too late": count.late}
-            lost = [f"{number} {what}" for what, number in numbers.items() if number]
+            sources[name] = {"kind": given.kind, "location": given.location, **count}
+            numbers = {"could not be used": count["dropped"], "came too late": count["late"]}
+            lost = [f"{number} {text}" for text, number in numbers.items() if number]
             if lost:
                 warnings.append(f"camera '{name}': of its pictures {' and '.join(lost)}")
-            if count.changes and count.changes[-1].stopped:
+            if count["changes"] and count["changes"][-1]["what"] == "stopped":
                 warnings.append(f"camera '{name}' had stopped by the end; check its connection")
         if sensors.skipped:
             warnings.append(

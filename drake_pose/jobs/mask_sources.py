@@ -1,26 +1,29 @@
 """Sources of masks by camera: folders of pictures, videos, COCO files and recorded episodes."""
 
-import itertools
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from drake_pose.arrays import Picture
 from drake_pose.camera.camera_files import CameraFile, load_camera_file
-from drake_pose.camera.episode import Episode
-from drake_pose.camera.episode_files import open_episode, recording_format
+from drake_pose.camera.episode import Stream
+from drake_pose.camera.episode_files import open_episode, recording_format, video_camera
 from drake_pose.camera.picture_files import (
     SUFFIXES,
     VIDEOS,
-    VideoPictures,
+    Video,
+    in_order,
     list_pictures,
+    read_binary_mask,
     read_picture,
+    threshold_mask,
 )
 from drake_pose.errors import SceneError
-from drake_pose.jobs.estimate.measurements import frames_of
-from drake_pose.silhouette.pictures.masks import AnnotatedPicture, read_coco
+from drake_pose.silhouette.pictures.masks import AnnotatedPicture, is_coco, read_coco
 from drake_pose.silhouette.pictures.scenes import CAMERA_FILE, common_rate
 
 
@@ -36,53 +39,37 @@ class Source:
     cameras: CameraFile | None = None  # Content of the camera file; None if there is none.
     # Picture files by camera and frame.
     pictures: Mapping[str, Mapping[str, Path]] = field(default_factory=dict)
-    # Video files by camera, of cameras without picture files.
-    videos: Mapping[str, Path] = field(default_factory=dict)
+    # Cameras of videos and of recorded episodes.
+    streams: Mapping[str, Stream] = field(default_factory=dict)
     # Pictures of COCO files, each after the name of the folder that its COCO file lies in ("": the
-    # source's); then pictures and videos are empty.
+    # source's); then there are no other pictures.
     annotated: Sequence[tuple[str, AnnotatedPicture]] = ()
-    # Recorded episode whose pictures are read; None if there is none.
-    episode: Episode | None = None
+    rate_hz: float | None = None  # Pictures per second of the streams; None: unknown.
+    warnings: tuple[str, ...] = ()  # Faults that do not prevent the use of the source.
     _sizes: dict[str, tuple[int, ...]] = field(default_factory=dict, repr=False, compare=False)
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the cameras."""
-        return (*self.pictures, *self.videos, *(self.episode.cameras if self.episode else ()))
+        return (*self.pictures, *self.streams)
 
-    def rate(self) -> tuple[float | None, tuple[str, ...]]:
-        """Return the frame rate [Hz] of videos or an episode, None if unknown, and warnings."""
-        if self.episode is None:
-            return common_rate(self.videos)
-        steps = np.diff(next(iter(self.episode.cameras.values())).times)
-        return (1.0 / float(np.median(steps)) if len(steps) else None), self.episode.warnings
-
-    def read(self, camera: str) -> Iterator[tuple[str, str, Picture]]:
+    def read(self, camera: str, *, as_masks: bool = False) -> Iterator[tuple[str, str, Any]]:
         """Yield each frame of a camera: name, origin for messages, and picture (H, W, 3) uint8 RGB.
 
-        Raises SceneError: a picture cannot be read, or differs in size from its camera.
+        ``as_masks``: the pictures show masks, which are returned instead, (H, W) bool.
+
+        Raises SceneError: a picture cannot be read, is no mask, or differs in size from its camera.
         """
+        read = partial(read_binary_mask, may_be_empty=True, lossy=True)
         for frame, path in self.pictures.get(camera, {}).items():
-            picture = read_picture(path, SceneError)
+            picture = read(path) if as_masks else read_picture(path)
             self.check_size(camera, picture.shape, str(path))
             yield frame, str(path), picture
-        if self.episode is not None and camera in self.episode.cameras:
-            recorded = self.episode.cameras[camera]
-            for k, frame in enumerate(frames_of(recorded)):
-                picture, where = recorded.read(k), f"{self.path}: camera '{camera}', picture {k}"
+        if (stream := self.streams.get(camera)) is not None:
+            for k, frame in enumerate(stream.names):
+                picture, where = stream.read(k), f"{self.path}: camera '{camera}', picture {k}"
                 self.check_size(camera, picture.shape, where)
-                yield frame, where, picture
-        if camera in self.videos:
-            video = VideoPictures(self.videos[camera])
-            for number in itertools.count():
-                try:
-                    picture = video.read(number)
-                except SceneError:
-                    if number < max(1, video.count):
-                        raise
-                    return
-                self.check_size(camera, picture.shape, str(self.videos[camera]))
-                yield f"{number:06d}", f"{self.videos[camera]}: frame {number:06d}", picture
+                yield frame, where, threshold_mask(picture, where) if as_masks else picture
 
     def check_size(self, camera: str, shape: tuple[int, ...], where: str) -> None:
         """Raise SceneError if a picture's size is not its camera's, or that of its first picture.
@@ -102,36 +89,42 @@ class Source:
                 f"{size[1]} x {size[0]}"
             )
 
-    def annotated_pictures(self) -> Iterator[tuple[str, str, AnnotatedPicture]]:
-        """Yield each picture of the COCO files: camera, frame and annotated picture.
+    def annotated_pictures(self) -> dict[str, dict[str, AnnotatedPicture]]:
+        """Return the pictures of the COCO files by camera and frame, frames in natural order.
 
         With a camera file, the camera is the last folder in the picture's path that is a camera's
-        name, else the COCO file's folder (in ``annotated``), else the only camera. Without, it is
-        the COCO file's folder, else the last folder in the picture's path, or "" if all pictures
-        lie in one folder.
+        name, else the COCO file's folder (in ``annotated``), else the only camera, else the one
+        with whose name the picture's name begins. Without, it is the COCO file's folder, else the
+        last folder in the picture's path, or "" if all pictures lie in one folder.
 
         Raises SceneError: the camera is unknown, or a frame occurs twice.
         """
         known = [] if self.cameras is None else list(self.cameras.cameras)
         places = {folder or one.file.parent for folder, one in self.annotated}
-        known_frames: set[tuple[str, str]] = set()
+        found: dict[str, dict[str, AnnotatedPicture]] = {}
         for folder, one in self.annotated:
-            file = one.file
+            file, frame = one.file, one.file.stem
+            camera = folder or (file.parent.name or None if len(places) > 1 else "")
             if known:
                 names = [*reversed(file.parent.parts), folder, *(known if len(known) == 1 else [])]
                 camera = next((name for name in names if name in known), None)
-            else:
-                camera = folder or (file.parent.name or None if len(places) > 1 else "")
+            if camera is None:
+                begun = [re.fullmatch(f"({re.escape(name)})[-_. ]+(.+)", frame) for name in known]
+                camera, frame = next((one.groups() for one in begun if one), (None, frame))
             if camera is None:
                 raise SceneError(
-                    f"{one.source}: picture '{file}': no folder of its path is a camera"
+                    f"{one.source}: picture '{one.name}': no folder of its path is a camera"
                     f"{f' of {self.camera_file}: ' + ', '.join(known) if known else ''}; the "
                     "paths must be <camera>/<frame>.png"
                 )
-            if (camera, file.stem) in known_frames:
-                raise SceneError(f"{one.source}: camera '{camera}' has frame {file.stem} twice")
-            known_frames.add((camera, file.stem))
-            yield camera, file.stem, one
+            before = found.setdefault(camera, {}).setdefault(frame, one)
+            if before is not one:
+                raise SceneError(
+                    f"{one.source}: camera '{camera}' has frame {frame} twice: '{before.name}' and "
+                    f"'{one.name}'; export each picture once (without augmentation), and give "
+                    "each camera a folder"
+                )
+        return {name: {frame: own[frame] for frame in in_order(own)} for name, own in found.items()}
 
 
 def open_source(path: Path, camera_file: Path | None, episode: int | None) -> Source:
@@ -154,13 +147,16 @@ def open_source(path: Path, camera_file: Path | None, episode: int | None) -> So
     cameras = None if camera_file is None else load_camera_file(camera_file)
     try:
         if episode is not None or recording_format(path) in ("lerobot", "droid", "bag"):
-            found = Source(path, episode=open_episode(path, episode=episode))
+            recorded = open_episode(path, episode=episode)
+            steps = np.diff(next(iter(recorded.cameras.values())).times)
+            rate = 1.0 / float(np.median(steps)) if len(steps) else None
+            found = Source(path, streams=recorded.cameras, rate_hz=rate, warnings=recorded.warnings)
         elif not path.is_file():
             found = _open_folder(path)
         elif (kind := path.suffix.lower()) == ".json":
             found = Source(path, annotated=[("", one) for one in read_coco(path)])
         elif kind in VIDEOS:
-            found = Source(path, videos={"": path})
+            found = _of_videos(path, {"": path})
         elif kind in SUFFIXES:
             found = Source(path, pictures={"": {path.stem: path}})
         else:
@@ -172,7 +168,7 @@ def open_source(path: Path, camera_file: Path | None, episode: int | None) -> So
             f"{path}: has no pictures images/<camera>/<frame>.png or .jpg, no videos "
             "videos/<camera>.mp4, no COCO file (.json), and is not a data set or bag"
         )
-    pictures, videos = found.pictures, found.videos
+    pictures, streams = found.pictures, found.streams
     if cameras is not None:
         known = list(cameras.cameras)
         for name in found.names:
@@ -187,10 +183,20 @@ def open_source(path: Path, camera_file: Path | None, episode: int | None) -> So
                 f"{len(known)} cameras: {', '.join(known)}; name the folder after one of them"
             )
         pictures = {name or known[0]: files for name, files in pictures.items()}
-        videos = {name or known[0]: file for name, file in videos.items()}
+        streams = {name or known[0]: one for name, one in streams.items()}
     return replace(
-        found, camera_file=camera_file, cameras=cameras, pictures=pictures, videos=videos
+        found, camera_file=camera_file, cameras=cameras, pictures=pictures, streams=streams
     )
+
+
+def _of_videos(
+    path: Path, files: Mapping[str, Path], pictures: Mapping[str, Mapping[str, Path]] | None = None
+) -> Source:
+    """Return the source of videos and pictures by camera; SceneError: a video is unreadable."""
+    videos = {name: Video(file) for name, file in files.items()}
+    streams = {name: video_camera(name, video) for name, video in videos.items()}
+    rate, warnings = common_rate(videos)
+    return Source(path, pictures=pictures or {}, streams=streams, rate_hz=rate, warnings=warnings)
 
 
 def _open_folder(path: Path) -> Source:
@@ -202,8 +208,10 @@ def _open_folder(path: Path) -> Source:
     places = [path / name for name in ("images", "videos") if (path / name).is_dir()]
     # Without pictures to segment, masks of another tool are read.
     roots = places or [path / "masks" if (path / "masks").is_dir() else path]
-    no_cameras = ("background", "overlay", "masks", "images", "videos")
-    folders = [("", root) for root in roots] + [
+    # CVAT and Label Studio put COCO files beside or before the folder of pictures.
+    beside = [folder for folder in (path, path / "annotations") if folder not in roots]
+    no_cameras = ("background", "overlay", "masks", "images", "videos", "annotations")
+    folders = [("", root) for root in (*roots, *beside) if root.is_dir()] + [
         (entry.name, entry)
         for root in roots
         for entry in sorted(root.iterdir())
@@ -213,12 +221,14 @@ def _open_folder(path: Path) -> Source:
     videos: dict[str, Path] = {}
     annotated: list[tuple[str, AnnotatedPicture]] = []
     for name, folder in folders:
-        if files := list_pictures(folder, SceneError):
+        if folder not in beside and (files := list_pictures(folder)):
             pictures[name] = files
         for file in sorted(folder.iterdir()):
             kind = "" if file.name.startswith(".") else file.suffix.lower()
-            if kind == ".json":
-                annotated += [(name, one) for one in read_coco(file)]
+            if kind == ".json" and (folder not in beside or is_coco(file)):
+                # Roboflow writes a COCO file into the folder of each part of a data set.
+                own = "" if name in ("train", "valid", "test") else name
+                annotated += [(own, one) for one in read_coco(file)]
             elif kind in VIDEOS and folder in roots:
                 if file.stem in videos:
                     raise SceneError(f"{file}: is a second video of '{file.stem}'; remove one")
@@ -233,4 +243,4 @@ def _open_folder(path: Path) -> Source:
             f"{roots[0]}: has pictures beside videos or folders of pictures; move them into a "
             "camera's folder"
         )
-    return Source(path, pictures=pictures, videos=videos)
+    return _of_videos(path, videos, pictures)

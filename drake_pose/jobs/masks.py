@@ -1,6 +1,7 @@
 """Masks for a scene: read from other tools, or segmented by a background."""
 
 import math
+import re
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -15,9 +16,8 @@ from drake_pose.arrays import Mask, Picture
 from drake_pose.camera.picture_files import (
     SUFFIXES,
     find_pictures,
-    read_binary_mask,
+    natural_key,
     read_picture,
-    threshold_mask,
 )
 from drake_pose.errors import (
     DrakePoseError,
@@ -66,11 +66,6 @@ class SceneMasks:
     # Content of its summary.json: for each camera and frame the mask's area [pixel] or why it was
     # rejected, and warnings.
     summary: Mapping[str, Any]
-
-    @property
-    def count(self) -> int:
-        """Number of masks in the scene."""
-        return int(self.summary["mask_count"])
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -136,7 +131,7 @@ def make_masks(
             first, *more = refused or [f"{opened.path}: has no picture"]
             raise MaskError(first + (f" (and {len(more)} more)" if more else ""))
         warnings = [*(f"{text}; no mask is written" for text in refused), *doubts]
-        warnings += opened.rate()[1]
+        warnings += opened.warnings
         warnings += [text for name, own in cameras.items() for text in _doubt_camera(name, own)]
         if opened.cameras is None and set(cameras) != {""}:
             warnings.append(
@@ -159,7 +154,20 @@ def make_masks(
 
 
 def _doubt_camera(name: str, frames: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
-    """Yield a warning if a camera's masks are doubtful; ``frames``: its entries of the summary."""
+    """Yield warnings if a camera's masks, or the order of its frames, are doubtful.
+
+    ``frames``: its entries of the summary.
+    """
+    texts = {tuple(text for text, _ in natural_key(frame)) for frame in frames}
+    hashes = [frame for frame in frames if len(re.findall(r"\d(?=[A-Za-z])", frame)) > 1]
+    found = [text for frame in hashes for text in re.findall("[0-9a-f]{8,}", frame)]
+    hexadecimal = {text for text in found if not text.isdigit()}
+    if hashes and (len(texts) > 1 or len(hexadecimal) > 1):
+        yield (
+            f"camera '{name or 'camera'}': the frames' names have parts like random ones, such as "
+            f"'{hashes[0]}': their order is hardly that of the pictures, and joint tables need the "
+            "same names; name the pictures 0000.png, 0001.png and so on before annotating them"
+        )
     known = {frame: one["agreement"] for frame, one in frames.items() if "agreement" in one}
     bad = [frame for frame, agreement in known.items() if agreement < MIN_AGREEMENT]
     if bad:
@@ -177,11 +185,10 @@ def _write_scene(source: Source, folder: Path, summary: Mapping[str, Any]) -> No
     try:
         if source.path.is_dir() and own.is_file():
             shutil.copyfile(own, folder / SCENE_FILE)
-        elif source.videos or source.episode:
-            rate, _ = source.rate()
-            content = {"sequence": True} | (
-                {} if rate is None else {"frame_rate_hz": round(rate, 6)}
-            )
+        elif source.streams:
+            content: dict[str, Any] = {"sequence": True}
+            if source.rate_hz is not None:
+                content["frame_rate_hz"] = round(source.rate_hz, 6)
             write_file(folder, SCENE_FILE, yaml.safe_dump(content))
         if source.camera_file is not None:
             shutil.copyfile(source.camera_file, folder / CAMERA_FILE)
@@ -260,7 +267,7 @@ def find_masks(
     Raises DrakePoseError: the message names the file, camera or frame at fault.
     """
     background = settings.background
-    if background is None and not settings.classes:
+    if background is None and not settings.classes and not source.annotated:
         # Without a segmentation method, a folder of background pictures implies one.
         beside = source.path / "background"
         background = beside if beside.is_dir() else None
@@ -301,8 +308,10 @@ def _read_given(source: Source, settings: MaskSettings) -> Iterator[FoundMask]:
     if not classes or "all" in classes:
         classes = set(known)
     require_known("class", classes, known, str(source.path))
-    for camera, frame, entry in source.annotated_pictures():
-        where = f"{entry.source}: picture '{entry.file}'"
+    pictures = source.annotated_pictures()
+    found = ((name, frame, one) for name, own in pictures.items() for frame, one in own.items())
+    for camera, frame, entry in found:
+        where = f"{entry.source}: picture '{entry.name}'"
         source.check_size(camera, (entry.height, entry.width), where)
         try:
             mask = entry.draw(classes)
@@ -311,14 +320,9 @@ def _read_given(source: Source, settings: MaskSettings) -> Iterator[FoundMask]:
         boxes = sum(not area for *_, area in entry.areas)
         left_out = f"{boxes} annotations have a box, but no area: left out"
         yield FoundMask(camera, frame, where, mask, warnings=(left_out,) if boxes else ())
-    for camera, files in source.pictures.items():
-        for frame, path in files.items():
-            mask = read_binary_mask(path, MaskError, may_be_empty=True, lossy=True)
-            source.check_size(camera, mask.shape, str(path))
-            yield FoundMask(camera, frame, str(path), mask)
-    for camera in (name for name in source.names if name not in source.pictures):
-        for frame, where, picture in source.read(camera):
-            yield FoundMask(camera, frame, where, threshold_mask(picture, where, MaskError))
+    for camera in source.names:
+        for frame, where, mask in source.read(camera, as_masks=True):
+            yield FoundMask(camera, frame, where, mask)
 
 
 def _background(
@@ -326,9 +330,8 @@ def _background(
 ) -> tuple[Background, tuple[str, ...]]:
     """Return a camera's background model, and warnings; raise a SceneError if there is no picture.
 
-    ``source``: the source. ``camera``: the camera's name. ``given``: picture, folder of pictures or
-    "median", as in ``MaskSettings.background``. ``max_count``: a median uses between this number
-    and twice as many pictures of a long recording.
+    ``given``: as ``MaskSettings.background``. ``max_count``: a median uses between this number and
+    twice as many pictures of a long recording.
     """
     if given == "median":
         # Pictures evenly spread over a recording of unknown length.
@@ -358,7 +361,7 @@ def _background(
         )
     pictures = []
     for file in files:
-        pictures.append(read_picture(file, SceneError))
+        pictures.append(read_picture(file))
         source.check_size(camera, pictures[-1].shape, str(file))
     return learn_background(pictures), ()
 

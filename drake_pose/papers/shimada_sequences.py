@@ -405,14 +405,12 @@ def run_sequence(
     truth = _truth(folder, inputs, hand)
     if names := [name for name in hand.flexions if name in truth]:
         moved = layout.indices(names)
-        errors = np.abs(
-            np.degrees(means[:, moved]) - np.column_stack([truth[name] for name in names])
-        )
+        true = np.column_stack([truth[name] for name in names])
+        errors = np.abs(np.degrees(means[:, moved]) - true)
         figures["flexion_error_median"] = float(np.median(errors))
         figures["flexion_error_mean"] = float(np.mean(errors))
-        figures["inside_2sigma"] = float(
-            np.mean(errors < 2.0 * np.degrees(run.deviations[:, moved]))
-        )
+        inside = errors < 2.0 * np.degrees(run.deviations[:, moved])
+        figures["inside_2sigma"] = float(np.mean(inside))
     return RecordedHand(folder.name, figures, observation, means, run.kept)
 
 

@@ -248,10 +248,7 @@ class _Capture:
             for frame in frames:
                 follow(None, frame, frame)
             return found
-        if known:
-            begin, start = min(known), known[min(known)]
-        else:
-            begin, start = self._best_start(frames)
+        begin, start = (min(known), known[min(known)]) if known else self._best_start(frames)
         index = list(frames).index(begin)
         # Forwards from the start, then backwards.
         for ordered in (frames[index:], frames[:index][::-1]):

@@ -121,7 +121,8 @@ class BodyPlan:
         self.landmarks = landmarks_of_nodes(tree, landmarks)
         # Whether each value bends the waist, a clavicle, wrist or ankle: no limb and no root (m,).
         motions = kinematics.motions(kinematics.flatten(tree.default_values()))
-        self.is_posture = kinematics.is_angle & ~motions.moves[self._node("neck")]
+        neck = self.landmarks.nodes[self.landmarks.names.index("neck")]
+        self.is_posture = kinematics.is_angle & ~motions.moves[neck]
         for limb in self.limbs.values():
             self.is_posture[limb.values] = False
         # Whether each angle tilts a part that is no limb (m,): its axis is horizontal at rest.
@@ -146,10 +147,6 @@ class BodyPlan:
             for kind, joints in kinds.items()
             for side in ("left", "right")
         }
-
-    def _node(self, landmark: str) -> int:
-        """Return the index of a landmark's node."""
-        return int(self.landmarks.nodes[self.landmarks.names.index(landmark)])
 
     def _plan(self, names: Sequence[str], count: int = 2048) -> PlannedLimb:
         """Plan a limb from its three landmarks' names, from root to end, in `count` poses.

@@ -91,6 +91,8 @@ class PictureMotion(NamedTuple):
     drift: float = 0.0  # Largest slow shift of the background between two nudges [pixel]; 0: none.
     # Median distance of the background's shift from its running median [pixel]; 0: none.
     shake: float = 0.0
+    # Fraction of one picture's corners that is found again in others, their median.
+    found_again: float = 1.0
 
 
 def find_camera_motion(
@@ -106,11 +108,11 @@ def find_camera_motion(
     rows = np.linspace(0, count - 1, min(count, MOTION.most)).round().astype(int)
     rows = np.unique([*range(3), *rows.tolist(), *range(count - 3, count)])
     tracker = _Background(read, int(rows[len(rows) // 2]), camera)
-    shifts = tracker.shifts(rows.tolist())
-    known = np.isfinite(shifts).all(axis=1)
+    shifts, again = np.split(tracker.shifts(rows.tolist()), [4], axis=1)
+    found_again, known = float(np.median(again)), np.isfinite(shifts).all(axis=1)
     # Where the background is often hidden or lost, nothing is known of the camera's motion.
     if known.sum() < max(4, 0.5 * len(rows)):
-        return PictureMotion(())
+        return PictureMotion((), found_again=found_again)
     rows, shifts = rows[known], shifts[known]
     steps = find_steps(shifts, tracker.least)
     steps = steps if len(steps) <= MOTION.most_nudges else []
@@ -130,6 +132,7 @@ def find_camera_motion(
         tuple(nudges),
         drift / tracker.scale if drift >= max(least, MOTION.noises * shake) else 0.0,
         shake / tracker.scale if shake >= least else 0.0,
+        found_again,
     )
 
 
@@ -192,7 +195,7 @@ def _bracket(
         tracker = _Background(read, reference, camera)
         while high - low > 1:
             k = (low + high) // 2
-            is_near = float(np.linalg.norm(tracker.shifts([k]))) < near
+            is_near = float(np.linalg.norm(tracker.shifts([k])[:, :4])) < near
             low, high = (k, high) if is_near == from_low else (low, k)
         return low, high
 
@@ -237,22 +240,24 @@ class _Background:
         return np.clip(128.0 + 40.0 * off / (spread + 4.0), 0.0, 255.0).astype(np.uint8)
 
     def shifts(self, rows: Sequence[int], at_once: int = 8) -> Array:
-        """Return the shifts (n, 4) of pictures, see `_shift`; at_once: pictures in memory."""
+        """Return the shifts (n, 5) of pictures, see `_shift`; at_once: pictures in memory."""
         shifts = list[Array]()
         for k in range(0, len(rows), at_once):
             shifts += map_ordered(self._shift, map(self._read, rows[k : k + at_once]))
         return np.array(shifts)
 
     def _shift(self, picture: Picture) -> Array:
-        """Return the shift (4,) of a picture's background [pixel of the tracked pictures].
+        """Return the shift (5,) of a picture's background [pixel of the tracked pictures].
 
         It is the motion of the picture's centre along u and along v; and the rotation and the
-        relative growth, each times a picture's root mean square radius. nan: not determined.
+        relative growth, each times a picture's root mean square radius. nan: not determined. The
+        last entry is the fraction of the reference picture's corners that is found again.
         """
-        unknown, corners = np.full(4, np.nan), self._corners
+        unknown, corners = np.append(np.full(4, np.nan), 1.0), self._corners
         if len(corners) < MOTION.least_corners:
             return unknown
         tracked, is_tracked = _track(self._reference, self._even(picture), corners)
+        unknown[4] = again = is_tracked.mean()
         points, moved = corners[is_tracked], tracked[is_tracked]
         if len(points) < MOTION.least_corners:
             return unknown
@@ -267,7 +272,7 @@ class _Background:
         still = np.count_nonzero(np.linalg.norm(moved - points, axis=1) < MOTION.close)
         follow = np.count_nonzero(misfits < MOTION.close)
         if still >= max(MOTION.static_share * follow, MOTION.least_corners / 2):
-            return np.zeros(4)
+            return np.array([0.0, 0.0, 0.0, 0.0, again])
         if np.count_nonzero(follows) < MOTION.least_share * len(points):
             return unknown
         # RANSAC fits two corners, which are noisy: all corners that follow are fitted again. If a
@@ -283,7 +288,7 @@ class _Background:
             fit = np.linalg.lstsq(used, moved[misfits < MOTION.near].T.ravel(), rcond=None)[0]
             misfits = np.linalg.norm(np.einsum("cjn,j->nc", rows, fit) - moved, axis=1)
         turn, grow = np.arctan2(fit[1], fit[0]), np.hypot(*fit[:2]) - 1.0
-        return np.array([*fit[2:4], self._radius * turn, self._radius * grow])
+        return np.array([*fit[2:4], self._radius * turn, self._radius * grow, again])
 
     def rotation(self, shift: Array) -> Array:
         """Return the rotation vector (3,) of directions [rad] that gives a shift (4,)."""

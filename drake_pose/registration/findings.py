@@ -24,13 +24,14 @@ class Finding:
     # and lengths [relative], principal points [pixel]; a camera's shift is that of its own centre.
     # Clock [s]: how much later the pictures' joint positions are logged. Rate [s/s]: how much
     # faster the log's clock runs.
-    angle: float
-    shift: float
+    angle: float = 0.0
+    shift: float = 0.0
     # angle_sd, shift_sd: their standard deviations; 0 for several joints.
-    angle_sd: float
-    shift_sd: float
-    pixels: float  # Root mean square distance by which it moves the outlines it affects [pixel].
-    p_value: float  # Probability of an error at least as large if nothing is wrong.
+    angle_sd: float = 0.0
+    shift_sd: float = 0.0
+    # Root mean square distance by which it moves the outlines it affects [pixel].
+    pixels: float = 0.0
+    p_value: float = 0.0  # Probability of an error at least as large if nothing is wrong.
     alternatives: tuple[str, ...] = ()  # Names of other causes that explain it equally well.
     # Significant corrections by joint, where several are wrong [rad or m].
     joints: Mapping[str, float] = field(default_factory=dict)

@@ -94,6 +94,15 @@ class EpipolarSearch:
             X = self._refined(A, X, scale)
         return float(self._gains(A, X, TRACKS.coarse[-1])[0]), X[0]
 
+    def explained(self, X_WL: Array, X_LC: Array) -> Array:
+        """Return the explained part (pairs,) of the matches of each pair of pictures.
+
+        X_WL: (frames, 4, 4) the link's poses. X_LC: (4, 4) the camera's pose on it.
+        """
+        residuals = self._residuals(self._motions(X_WL), X_LC[None])
+        own = np.sqrt(_weights(residuals, TRACKS.coarse[-1]))[0]
+        return np.asarray(np.bincount(self._pair, own, len(self._pairs)), np.float64)
+
     def _motions(self, X_WL: Array) -> Array:
         """Return the link's motion (pairs, 4, 4) between the two pictures of each pair."""
         i, j = self._pairs.T

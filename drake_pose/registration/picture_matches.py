@@ -97,18 +97,13 @@ def _mutual(a: Array | None, b: Array | None) -> Indices:
 
 def _on_epipolar_lines(uv: Array) -> NDArray[np.bool_]:
     """Return which of a pair's matches (n, 2, 2) agree with one epipolar geometry."""
-    none = np.zeros(len(uv), np.bool_)
-    if len(uv) < MATCHING.least:
-        return none
-    cv2.setRNGSeed(0)
-    F, mask = cv2.findFundamentalMat(
-        np.ascontiguousarray(uv[:, 0]), np.ascontiguousarray(uv[:, 1]),
-        cv2.FM_RANSAC, MATCHING.epipolar, 0.99, 1000,
-    )  # fmt: skip
-    if F is None or mask is None:
-        return none
-    inside = mask.ravel() > 0
-    return inside if np.count_nonzero(inside) >= MATCHING.least else none
+    if len(uv) >= MATCHING.least:
+        cv2.setRNGSeed(0)
+        a, b = np.ascontiguousarray(uv[:, 0]), np.ascontiguousarray(uv[:, 1])
+        F, mask = cv2.findFundamentalMat(a, b, cv2.FM_RANSAC, MATCHING.epipolar, 0.99, 1000)
+        if F is not None and mask is not None and np.count_nonzero(mask) >= MATCHING.least:
+            return np.asarray(mask.ravel() > 0)
+    return np.zeros(len(uv), np.bool_)
 
 
 def _tracks(edges: Indices, picture: Indices, uv: Array) -> Sightings:

@@ -141,7 +141,7 @@ def _register(
         near += _fit_near(begun, more, task)
         if width and not task.offset_joints:
             search = begun.mirrored()
-            mirrored += _rough_fits(
+            mirrored += _fit_near(
                 search, search.search(rotations=rotations, least_width=width, others=0)
             )
             # In mirrored pictures a pose may be found more easily; the right one is opposite.
@@ -160,11 +160,11 @@ def _register(
         if found.fit.ratios.mean() < well:
             # A wrong pose in mirrored pictures need not be opposite the right one.
             search = near[0].search.mirrored()
-            mirrored += _rough_fits(search, search.search(others=0))
+            mirrored += _fit_near(search, search.search(others=0))
         _require_unmirrored(task, near[0], mirrored, found)
         return found
     stuck = stuck_pictures(task.recording)
-    raise RegistrationError(f"{refused}: {stuck}") if stuck else refused
+    raise RegistrationError(f"{stuck} {refused}") if stuck else refused
 
 
 def _fit(
@@ -258,22 +258,18 @@ def _other_poses(
     return level.distinct([X_CW, *alike])[1:], runner_up
 
 
-def _rough_fits(search: PictureSearch, poses: Sequence[Array]) -> list[RoughPose]:
-    """Return cameras fitted roughly from the first PICTURES.fitted poses (4, 4), best first."""
-    poses = poses[: PICTURES.fitted]
-    return coarse_fits([search] * len(poses), poses)
-
-
-def _fit_near(search: PictureSearch, poses: Sequence[Array], task: _Task) -> list[RoughPose]:
+def _fit_near(
+    search: PictureSearch, poses: Sequence[Array], task: _Task | None = None
+) -> list[RoughPose]:
     """Return cameras roughly fitted from the first PICTURES.fitted poses X_CW (4, 4), best first.
 
-    search: the search; those returned have joint offsets added, or another lens.
+    search: the search; those returned have joint offsets added, or another lens, if `task` asks.
     """
     poses = poses[: PICTURES.fitted]
-    if task.guessed_lens:
+    if task and task.guessed_lens:
         search, poses = _scan_lenses(search, poses)
     searches = [search] * len(poses)
-    if task.offset_joints:
+    if task and task.offset_joints:
         both = map_ordered(partial(search.fit_offsets, task.offset_joints), poses)
         searches, poses = [one for one, _ in both], [X_CW for _, X_CW in both]
     return coarse_fits(searches, poses)

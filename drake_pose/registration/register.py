@@ -331,10 +331,8 @@ class CameraSearch:
         def best_first(X_CW: Sequence[Array] | Array, side: float) -> list[Array]:
             """Return poses (4, 4) in the order of mean E_total; side: as of `overlap_areas`."""
             # The error of a frame is clipped at 1.
-            off = np.minimum(E_total(overlap_areas(posed, np.asarray(X_CW), side)), 1.0).mean(
-                axis=1
-            )
-            return [X_CW[k] for k in np.argsort(off, kind="stable")]
+            off = np.minimum(E_total(overlap_areas(posed, np.asarray(X_CW), side)), 1.0)
+            return [X_CW[k] for k in np.argsort(off.mean(axis=1), kind="stable")]
 
         starts = np.tile(np.eye(4), (len(self._R_CW), 1, 1))
         starts[:, :3, :3] = self._R_CW

@@ -7,12 +7,14 @@ from typing import NamedTuple, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import stdtr, stdtrit
+from scipy.special import ndtri, stdtr, stdtrit
 
 from drake_pose.arrays import Array, Picture
 from drake_pose.body import inverse_transforms
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError, listed
+from drake_pose.fit.covariance import vuong_statistic
+from drake_pose.fit.judge import LEVEL
 from drake_pose.registration.hand_eye import (
     EpipolarSearch,
     LinkPoses,
@@ -90,6 +92,16 @@ class TrackRegistration:
     seen: Sightings  # N sightings of points, by index of the frames of `found`.
     inliers: NDArray[np.bool_]  # (n,) which sightings are inliers.
     pictures: dict[str, Picture]  # (H, W, 3) by frame name.
+    # (p, 3) places of the points in the world [m], and (frames, 4, 4) poses of the link.
+    points: Array
+    link_poses: Array
+
+    def points_in(self, camera: PinholeCamera) -> Array:
+        """Return where a camera at a pose X_LC would see each sighting's point (n, 2) [pixel]."""
+        X_CW = inverse_transforms(self.link_poses @ camera.X_WC)[self.seen.frames]
+        p_WP = self.points[self.seen.points]
+        p_CP = np.einsum("nij,nj->ni", X_CW[:, :3, :3], p_WP) + X_CW[:, :3, 3]
+        return camera.with_pose(np.eye(4)).project(p_CP)[0]
 
 
 def register_tracks(
@@ -130,8 +142,9 @@ def register_tracks(
     poses, constants, explained, chance = _search(problem, matches, focal, timed)
     if explained < settings.least_gain * chance:
         search, values = EpipolarSearch(camera, matches), recording.values_at(0.0)[rows]
-        elsewhere = explaining_link(body, base, values, search)
-        _refuse_unexplained(camera, link, len(matches.uv), explained, chance, *elsewhere)
+        others = explaining_links(body, base, values, search, settings.chance_rotations)
+        gain, name = (others[0][0], body.tree.nodes[others[0][1]].name) if others else (0.0, "")
+        _refuse_unexplained(camera, link, len(matches.uv), explained, chance, gain, name)
     problem, fit, covariance, alike, likely = _fit_scene(body, link, problem, poses, constants)
     scale = float(np.exp(fit.constants[0]))
     placed = replace(
@@ -158,6 +171,8 @@ def register_tracks(
         seen,
         fit.inliers,
         dict(zip((misfit.frame for misfit in misfits), pictures, strict=True)),
+        fit.points,
+        problem.link_poses(fit.constants[1:]),
     )
 
 
@@ -186,12 +201,7 @@ def _search(
         )
         if gain > explained:
             explained, X_LC, constants[1] = gain, X, time
-    # Shifts give each picture the joint positions of another one.
-    count = int(problem.seen.frames.max()) + 1
-    chance = max(
-        search.search(np.roll(X_WL, shift, axis=0), settings.chance_rotations)[0][0]
-        for shift in {max(1, round(part * count)) for part in (0.25, 0.5, 0.75)}
-    )
+    chance = _by_chance(search, X_WL, settings.chance_rotations)
     poses = [X for gain, X in others if gain > 0.7 * explained]
     return [X_LC, *poses[:2]], constants, explained, chance
 
@@ -246,29 +256,97 @@ def recorded_link_poses(
     return poses
 
 
-def explaining_link(
-    body: RegistrationBody,
-    base: int,
-    values: Array,
-    search: EpipolarSearch,
-    links: int = 4,
-) -> tuple[float, str]:
-    """Return the fraction of the matches that a camera on another link explains, and that link.
+def explaining_links(
+    body: RegistrationBody, base: int | None, values: Array, search: EpipolarSearch, rotations: int
+) -> list[tuple[float, int, Array, Array]]:
+    """Return how well cameras on the links that move explain matches, the best first.
 
     Args:
-        body, base: as of ``recorded_link_poses``; the tree's first link is left out.
+        body: the robot; its pose tree's first link is left out.
+        base: index of a node that stands still; None: the tree starts in the world.
         values: (pictures, m) of the pose tree.
         search: in the pictures.
-        links: number of links that are tried, the nearest ones in the tree.
+        rotations: number of rotations that are tried.
+
+    Returns for each link the explained fraction of the matches, the link's node, its poses
+    (pictures, 4, 4) in the base's frame, and the camera's pose X_LC (4, 4) on it. Links that stand
+    still on an earlier one are left out.
     """
-    poses = np.array([body.kinematics.poses(row) for row in values])
-    X_WN = inverse_transforms(poses[:, [base]]) @ poses
-    gains = [
-        (search.search(X_WN[:, k], STANDING_SCENE.chance_rotations)[0][0], node.name)
-        for k, node in enumerate(body.tree.nodes[: links + 1])
-        if k and np.ptp(X_WN[:, k], axis=0).max() > 0.01
+    X_WN = np.array([body.kinematics.poses(row) for row in values])
+    if base is not None:
+        X_WN = inverse_transforms(X_WN[:, [base]]) @ X_WN
+    found = list[tuple[float, int, Array, Array]]()
+    for k in range(0 if base is None else 1, X_WN.shape[1]):
+        X_WL = X_WN[:, k]
+        offsets = [inverse_transforms(one[2]) @ X_WL for one in found]
+        moves = all(np.ptp(X, axis=0).max() > 1e-6 for X in offsets)
+        if moves and np.ptp(X_WL, axis=0).max() > 0.01:
+            gain, X_LC = search.search(X_WL, rotations)[0]
+            found.append((gain, k, X_WL, X_LC))
+    return sorted(found, key=lambda one: -one[0])
+
+
+def carrying_links(
+    body: RegistrationBody, camera: PinholeCamera, recording: Recording, rotations: int = 500
+) -> tuple[str, ...]:
+    """Return the links that may carry a camera whose background moves with the robot.
+
+    A link's motion must explain the motion of the pictures much better than the link's motion at
+    other moments does, and no other link's may explain it significantly better (``fit.judge``). Of
+    a hand and its fingers, which move little on it, only the hand is returned.
+
+    Args:
+        body: the robot, whose pose tree starts in the world.
+        camera: its intrinsics; its pose is not used.
+        recording: the camera's pictures and the joint log.
+        rotations: number of rotations that are searched for each link.
+
+    Returns the names of the links, the likeliest first; (): the camera does not ride on any, or too
+    little is matched between its pictures.
+
+    Raises RegistrationError: as ``choose_pictures``.
+    """
+    settings, nodes = STANDING_SCENE, body.tree.nodes
+    slow, fast = choose_pictures(body, camera, recording, settings.pictures, moving=settings.moving)
+    rows = sorted({*slow, *fast})
+    matches, _ = match_pictures([recording.read(k) for k in rows])
+    if len(matches.uv) < settings.least:
+        return ()
+    search = EpipolarSearch(camera, matches)
+    found = explaining_links(body, None, recording.values_at(0.0)[rows], search, rotations)
+    if not found:
+        return ()
+    explained, _, X_WL, X_LC = found[0]
+    if explained < settings.least_gain * _by_chance(search, X_WL, rotations):
+        return ()
+    own, most = search.explained(X_WL, X_LC), float(ndtri(1.0 - LEVEL))
+    likely = [
+        k
+        for _, k, X_WN, X_NC in found
+        if vuong_statistic(own, search.explained(X_WN, X_NC)) <= most
     ]
-    return max(gains, default=(0.0, ""))
+
+    def is_finger(k: int) -> bool:
+        """Return whether another candidate carries node k, beyond a link that branches."""
+        branches = False
+        while (above := nodes[k].parent) >= 0:
+            branches = branches or sum(node.parent == above for node in nodes) > 1
+            if branches and above in likely:
+                return True
+            k = above
+        return False
+
+    return tuple(nodes[k].name for k in likely if not is_finger(k))
+
+
+def _by_chance(search: EpipolarSearch, X_WL: Array, rotations: int) -> float:
+    """Return the largest explained fraction with the link's poses of other pictures.
+
+    X_WL: (pictures, 4, 4) the link's poses, which are shifted by quarters of the pictures.
+    """
+    shifts = {max(1, round(part * len(X_WL))) for part in (0.25, 0.5, 0.75)}
+    shifted = [np.roll(X_WL, shift, axis=0) for shift in shifts]
+    return max(search.search(X, rotations)[0][0] for X in shifted)
 
 
 def _require_matches(camera: PinholeCamera, matches: Matches, count: int) -> None:
@@ -445,14 +523,6 @@ def _describe_offsets(
         value, deviation = float(fit.constants[k]), float(deviations[6 + k])
         width = float(stdtrit(freedom, 1.0 - 0.5 * SHARED.level)) * deviation
         p_value = 2.0 * float(stdtr(freedom, -abs(value) / deviation))
-        parameters.append(
-            KinematicParameter(
-                name,
-                value,
-                deviation,
-                value - width,
-                value + width,
-                p_value < SHARED.level / len(asked),
-            )
-        )
+        interval, differs = (value - width, value + width), p_value < SHARED.level / len(asked)
+        parameters.append(KinematicParameter(name, value, deviation, *interval, differs))
     return tuple(parameters)

@@ -280,7 +280,13 @@ class _MultiStartRun:
             if looks_exact and not searched:
                 found = find_exactly()
             if looks_exact and (found is None or found.J > exactly):
-                found = self._refine_by_pixels(found, poses[0].values)
+                # The pose by pixels must explain the masks better than the robust one as it is.
+                start, J = poses[0].values, self._J(poses[0].values)
+                if self._proceed():
+                    other = exact.refine(problem, self._parameters(start), self._deadline)
+                    found = min((one for one in (found, other) if one), key=lambda one: one.J)
+                most = min(J, exact.settings.plausible * problem.border_length)
+                found = found if found is not None and found.J < most else None
         begin, pose_set = time.perf_counter(), None
         # Evaluations for the pose set, which come later, are not counted.
         steps = self._fit.evaluations
@@ -316,21 +322,6 @@ class _MultiStartRun:
         starts = self._coarse.choose_distinct(coarse, settings.starts, settings.separation)
         values = [*self._values(starts), *self._known]
         return refine_best(self._fit, values, self._passes, self._proceed)
-
-    def _refine_by_pixels(self, found: ExactPose | None, values: np.ndarray) -> ExactPose | None:
-        """Refine values (m,) by pixels, and return the better of the result and ``found``.
-
-        ``found``: the pose of the search by pixels; None: that search found none. ``values``: (m,)
-        values of the best pose by robust costs [rad or m]. Returns the better pose; None if J of
-        neither is below ``settings.plausible``, or if J at the values as they are is smaller.
-        """
-        exact, J = self._search.exact, self._J(values)
-        length = self._problem.border_length
-        if self._proceed():
-            other = exact.refine(self._problem, self._parameters(values), self._deadline)
-            found = min((one for one in (found, other) if one), key=lambda one: one.J)
-        explained = found is not None and found.J < min(J, exact.settings.plausible * length)
-        return found if explained else None
 
     def _looks_exact(self, values: np.ndarray) -> bool:
         """Return whether masks may be exact: their border is the body's at ``values`` (m,)."""

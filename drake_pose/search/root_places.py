@@ -97,7 +97,21 @@ def find_root_places(
         # The smallest eigenvalue is about the squared sine of half the angle between two rays; it
         # is 0 for parallel rays.
         if np.linalg.eigvalsh(A)[0] >= 0.01:
-            return [_places_in_space(views, main, np.linalg.solve(A, b), float(sizes[0]))]
+            # The points of a grid in space that project into or near all silhouettes.
+            extent = _extent(main.mask) / float(sizes[0])
+            half = 0.75 * extent * (settings.cut_off if _touches_edge(main.mask) else 1.0)
+            spacing = extent / settings.positions_across
+            steps = spacing * np.arange(-np.ceil(half / spacing), np.ceil(half / spacing) + 1)
+            grid = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), -1).reshape(-1, 3)
+            points = np.linalg.solve(A, b) + grid
+            for view in views:
+                places, depth = view.camera.project(points)
+                visible = np.ones(len(points), dtype=np.bool_)
+                if not isinstance(view.camera, ParallelCamera):
+                    visible = depth > view.camera.near
+                visible[visible] = _near(view, places[visible])
+                points = points[visible]
+            return [RootPlaces(tuple(views), points)]
     p_CR = in_camera(camera, body.sampled.X_PN[0][0, :3, 3])
     # Places (n, 2) of the root in the image, or beyond its border if the mask touches that [pixel].
     low, high = _box(main.mask)
@@ -239,26 +253,3 @@ def _lift(camera: Camera, places: np.ndarray, depth: float) -> np.ndarray:
 def in_camera(camera: Camera, p_W: np.ndarray) -> np.ndarray:
     """Return the point p_W (3,) of the world in the camera's frame [m]."""
     return np.asarray(camera.X_CW[:3, :3] @ p_W + camera.X_CW[:3, 3])
-
-
-def _places_in_space(
-    views: Sequence[View], main: View, middle: np.ndarray, size: float
-) -> RootPlaces:
-    """Return the points of a grid in space that project into or near all silhouettes.
-
-    ``main``: the view with the largest one. ``middle``: (3,) centre of the grid in the world [m].
-    ``size``: likeliest number of pixels per metre at the body in ``main``.
-    """
-    settings, extent = RootPlacementSettings(), _extent(main.mask) / size
-    half = 0.75 * extent * (settings.cut_off if _touches_edge(main.mask) else 1.0)
-    spacing = extent / settings.positions_across
-    steps = spacing * np.arange(-np.ceil(half / spacing), np.ceil(half / spacing) + 1)
-    points = middle + np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), -1).reshape(-1, 3)
-    for view in views:
-        places, depth = view.camera.project(points)
-        visible = np.ones(len(points), dtype=np.bool_)
-        if not isinstance(view.camera, ParallelCamera):
-            visible = depth > view.camera.near
-        visible[visible] = _near(view, places[visible])
-        points = points[visible]
-    return RootPlaces(tuple(views), points)

@@ -2,8 +2,8 @@
 
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -15,7 +15,6 @@ from pydrake.systems.sensors import ImageLabel16I, ImageRgba8U
 from drake_pose.arrays import Mask, Picture
 from drake_pose.camera.models import Camera
 from drake_pose.camera.sources import FrameSource, TimedPicture
-from drake_pose.camera.synchroniser import CameraChange, Synchroniser
 from drake_pose.errors import CameraError, SettingsError, require_known
 from drake_pose.silhouette.pictures.label_renderer import fill_label_image, label_image_to_mask
 from drake_pose.silhouette.pictures.scenes import USUAL_RATE_HZ
@@ -24,14 +23,90 @@ from drake_pose.systems.cameras import colour_image_to_picture, fill_colour_imag
 from drake_pose.systems.ports import PortedSystem, require_period
 
 
-@dataclass(frozen=True)
-class CameraCount:
-    """Counters of a camera's pictures."""
+class Synchroniser:
+    """Groups the pictures of several cameras into synchronised frames.
 
-    used: int  # Number of pictures in synchronised frames that were shown.
-    dropped: int  # Number of pictures that could not be used.
-    late: int  # Number of pictures that arrived after their synchronised frames.
-    changes: tuple[CameraChange, ...]  # When the camera stopped and returned.
+    A group starts with the earliest unused picture; each other camera contributes its earliest
+    picture if that is at most the tolerance later. A group is complete once each camera has
+    provided its picture or a later one. A camera that provides none is awaited for the timeout,
+    then left out of the group, and not awaited again until it provides a picture. A picture that
+    arrives after its group is dropped.
+
+    Args:
+        cameras: names of the cameras.
+        tolerance: maximum time between pictures of one group [s]; half a period for cameras that
+            are triggered together.
+        timeout: timeout for a camera [s], at least the tolerance.
+
+    Attributes:
+        late: number of dropped pictures by camera.
+        changes: (camera, time, stopped) of each camera that stopped or returned so far; the time is
+            that of its last picture before it stopped (nan if it never had one), or of its first
+            one after it returned [s].
+    """
+
+    def __init__(self, cameras: Iterable[str], tolerance: float, timeout: float) -> None:
+        self.cameras, self.tolerance, self.timeout = tuple(cameras), tolerance, timeout
+        self.late = dict.fromkeys(self.cameras, 0)
+        self.changes: list[tuple[str, float, bool]] = []
+        self._queues = {name: deque[tuple[float, TimedPicture]]() for name in self.cameras}
+        self._last_times: dict[str, float] = {}
+        self._newest = -math.inf
+        self._group_time = -math.inf
+        self._group_cameras: set[str] = set()
+        self._ignored_cameras: set[str] = set()
+        self._finished: set[str] = set()
+
+    def waiting(self, camera: str) -> int:
+        """Return the number of a camera's pictures that wait for their group."""
+        return len(self._queues[camera])
+
+    def add(self, camera: str, time: float, picture: TimedPicture) -> bool:
+        """Add a camera's next picture; return whether it can be part of a group.
+
+        If not, because its group was taken or its time stamp is not later than the camera's last
+        one, the picture is dropped. ``time``: time stamp [s].
+        """
+        missed = time <= self._group_time + self.tolerance and camera not in self._group_cameras
+        if missed or time <= self._group_time or time <= self._last_times.get(camera, -math.inf):
+            self.late[camera] += 1
+            return False
+        if camera in self._ignored_cameras:
+            self._ignored_cameras.discard(camera)
+            self.changes.append((camera, time, False))
+        self._queues[camera].append((time, picture))
+        self._last_times[camera] = time
+        self._newest = max(self._newest, time)
+        return True
+
+    def finish(self, camera: str) -> None:
+        """Declare that a camera will provide no more pictures, so that it is not awaited."""
+        self._finished.add(camera)
+
+    def take(self, now: float = -math.inf) -> tuple[float, dict[str, TimedPicture]] | None:
+        """Return the next group: its earliest time stamp [s], and its pictures by camera.
+
+        None if there is none, or a camera is still awaited. ``now``: the time [s], if it is later
+        than the latest time stamp.
+        """
+        heads = {name: queue[0][0] for name, queue in self._queues.items() if queue}
+        if not heads:
+            return None
+        begin = min(heads.values())
+        there = {*heads, *self._ignored_cameras, *self._finished}
+        awaited = [name for name in self.cameras if name not in there]
+        if awaited:
+            if max(now, self._newest) < begin + self.timeout:
+                return None
+            self._ignored_cameras.update(awaited)
+            self.changes += [(one, self._last_times.get(one, math.nan), True) for one in awaited]
+        pictures = {
+            name: self._queues[name].popleft()[1]
+            for name in self.cameras
+            if name in heads and heads[name] <= begin + self.tolerance
+        }
+        self._group_time, self._group_cameras = begin, set(pictures)
+        return begin, pictures
 
 
 class PictureCapture(PortedSystem):
@@ -83,15 +158,15 @@ class PictureCapture(PortedSystem):
     ) -> None:
         super().__init__()
         require_known("camera", sources, cameras, "the calibration")
+        if not sources:
+            raise SettingsError("a capture needs the source of at least one camera")
         self._sources = dict(sources)
         self.live = any(one.specification.live for one in sources.values())
         rates = [rate for one in sources.values() if (rate := one.rate_hz) is not None]
         self.period = 1.0 / max(rates, default=USUAL_RATE_HZ)
         require_period("capture", self.period)
         tolerance = (0.9 if self.live else 0.5) * self.period
-        self._synchroniser: Synchroniser[TimedPicture] = Synchroniser(
-            self._sources, tolerance, timeout=4.0 * self.period
-        )
+        self._synchroniser = Synchroniser(self._sources, tolerance, timeout=4.0 * self.period)
         self._clock, self._opening_timeout = clock, opening_timeout
         self._since: float | None = None
         self._opened: set[str] = set()
@@ -100,8 +175,8 @@ class PictureCapture(PortedSystem):
         self._pending: dict[str, TimedPicture | None] = dict.fromkeys(self._sources)
         self.frames: tuple[float, dict[str, TimedPicture]] | None = None  # Time [s], by camera.
         self._used = dict.fromkeys(self._sources, 0)
-        self._changes: dict[str, list[CameraChange]] = {name: [] for name in self._sources}
         self._reports: list[str] = []
+        self._reported = 0
         self.skipped = 0
         self._time = self.DeclareDiscreteState(np.array([math.nan]))
         self._fresh = self.DeclareDiscreteState(1)
@@ -120,11 +195,25 @@ class PictureCapture(PortedSystem):
         self.DeclarePeriodicUnrestrictedUpdateEvent(self.period, 0.0, self._update)
         self.DeclareForcedUnrestrictedUpdateEvent(self._update)
 
-    def counts(self) -> dict[str, CameraCount]:
-        """Return the counters of each camera, by name."""
-        late, changes = self._synchroniser.late, self._changes
+    def counts(self) -> dict[str, dict[str, Any]]:
+        """Return what became of each camera's pictures, by the camera's name.
+
+        ``used``, ``dropped``, ``late``: number of pictures in synchronised frames that were shown,
+        of those that could not be used, and of those that arrived after their synchronised frames.
+        ``changes``: each ``time`` [s] at which the camera stopped or returned, and ``what`` it did.
+        """
+        what, synchroniser = ("returned", "stopped"), self._synchroniser
         return {
-            name: CameraCount(self._used[name], one.dropped, late[name], tuple(changes[name]))
+            name: {
+                "used": self._used[name],
+                "dropped": one.dropped,
+                "late": synchroniser.late[name],
+                "changes": [
+                    {"time": time, "what": what[stopped]}
+                    for camera, time, stopped in synchroniser.changes
+                    if camera == name
+                ],
+            }
             for name, one in self._sources.items()
         }
 
@@ -157,15 +246,15 @@ class PictureCapture(PortedSystem):
             if newer is None:
                 break
             frames, self.skipped = newer, self.skipped + 1
-        for change in self._synchroniser.take_changes():
-            self._changes[change.camera].append(change)
-            if not change.stopped:
-                text = f"returned at {change.time:.2f} s"
-            elif math.isnan(change.time):
+        for camera, at, stopped in self._synchroniser.changes[self._reported :]:
+            if not stopped:
+                text = f"returned at {at:.2f} s"
+            elif math.isnan(at):
                 text = "gives no picture; the others go on without it"
             else:
-                text = f"stopped at {change.time:.2f} s; the others go on without it"
-            self._reports.append(f"camera '{change.camera}' {text}")
+                text = f"stopped at {at:.2f} s; the others go on without it"
+            self._reports.append(f"camera '{camera}' {text}")
+        self._reported = len(self._synchroniser.changes)
         state.get_mutable_discrete_state(self._fresh).SetFromVector([float(frames is not None)])
         if frames is None:
             ended = all(source.ended for source in self._sources.values())

@@ -45,13 +45,8 @@ def write(folder: Path, text: str, name: str = "thing.urdf") -> Path:
 
 # A floating trunk; an arm of two joints through a link without geometry, then a prismatic hand.
 FLOATING_URDF = urdf(
-    link("trunk"),
-    link("between", ""),
-    link("arm"),
-    link("hand"),
-    link("welded", SPHERE),
-    link("leg"),
-    link("toe", ""),
+    *(link("trunk"), link("between", ""), link("arm"), link("hand"), link("welded", SPHERE)),
+    *(link("leg"), link("toe", "")),
     joint("shoulder_x", "revolute", "trunk", "between", axis="1 0 0"),
     joint("shoulder_y", "revolute", "between", "arm", axis="0 1 0"),
     joint("slide", "prismatic", "arm", "hand", axis="0 1 1", limits='lower="-0.2" upper="0.3"'),
@@ -63,9 +58,7 @@ FLOATING_URDF = urdf(
 # A similar body on three prismatic and three revolute joints.
 JOINTED_BASE_URDF = urdf(
     *(link(name, "") for name in ("bx", "by", "bz", "ry", "rz")),
-    link("head"),
-    link("chest"),
-    link("arm"),
+    *map(link, ("head", "chest", "arm")),
     joint("x", "prismatic", "world", "bx", axis="1 0 0", limits='lower="-10" upper="10"'),
     joint("y", "prismatic", "bx", "by", axis="0 1 0", limits='lower="-10" upper="10"', origin=""),
     joint("z", "prismatic", "by", "bz", axis="0 0 1", limits='lower="-10" upper="10"', origin=""),
@@ -78,9 +71,7 @@ JOINTED_BASE_URDF = urdf(
 
 # An arm welded to the world.
 WELDED_URDF = urdf(
-    link("base"),
-    link("upper"),
-    link("lower"),
+    *map(link, ("base", "upper", "lower")),
     joint("mount", "fixed", "world", "base", limits=None),
     joint("a1", "revolute", "base", "upper", axis="0 0 1"),
     joint("a2", "revolute", "upper", "lower", axis="0 1 0"),

@@ -57,9 +57,8 @@ def test_node_poses_of_coupled_joints_match_the_plant(tmp_path, root, step):
     kinematics = TreeKinematics(tree)
     if root is None:
         assert kinematics.names == ("wrist", "lead", "scratch", "far")
-        assert [tree.nodes[tree.source(i)].name for i in range(6)] == [
-            "palm", "one", "one", "one", "nail", "far"
-        ]  # fmt: skip
+        sources = [tree.nodes[tree.source(i)].name for i in range(6)]
+        assert sources == ["palm", "one", "one", "one", "nail", "far"]
     generator = np.random.default_rng(3)
     for _ in range(5):
         _, values = drawn(tree, generator)
@@ -82,9 +81,13 @@ def test_report_lists_enforced_couplings_and_warns_of_others(tmp_path):
     (warning,) = model_warnings(tree.model, tree)
     assert "'far' is written to follow joint 'lead'" in warning
     nodes = {node["name"]: node["joints"] for node in describe_model(write(tmp_path, HAND)).nodes}
-    assert [joint["follows"] for name in ("one", "two") for joint in nodes[name]] == [
-        "", "-1 lead +0.1"
-    ]  # fmt: skip
+    assert [nodes[name][0]["follows"] for name in ("one", "two")] == ["", "-1 lead +0.1"]
+    # A leader behind its follower: the tree has the follower's position, the report the model's.
+    mimic = '<mimic joint="B" multiplier="2"/>'
+    serial = joint("A", "revolute", "world", "a", more=mimic), joint("B", "revolute", "a", "b")
+    path = write(tmp_path, urdf(link("world", ""), *map(link, "ab"), *serial))
+    joints = [one["joints"][0] for one in describe_model(path).nodes]
+    assert [(one["name"], one["follows"]) for one in joints] == [("A", "2 B +0"), ("B", "")]
 
 
 @pytest.mark.parametrize("lengths", [False, True])
@@ -111,10 +114,8 @@ def test_couplings_intersect_limits_and_propagate_held_values(tmp_path):
         tree_of(tmp_path, apart)
 
 
-MIMIC = (
-    '<mimic joint="lead"><multiplier>-2</multiplier><offset>.1</offset><reference>.2</reference>'
-    "</mimic>"
-)
+MIMIC = """<mimic joint="lead"><multiplier>-2</multiplier><offset>.1</offset>
+<reference>.2</reference></mimic>"""
 SDF = sdf.sdf(
     *map(sdf.link, "abc"),
     sdf.joint("lead", "a", "b", kind="prismatic"),

@@ -83,9 +83,8 @@ def test_errors_name_invalid_links_and_positions(tmp_path):
             landmark_positions(model, {}, bad)
 
 
-@pytest.mark.parametrize(
-    ("text", "complaint"),
-    [
+def test_errors_name_the_file_and_the_entry(tmp_path):
+    for text, complaint in (
         ("", "one mapping 'landmarks'"),
         ("landmarks: {}", "one mapping 'landmarks'"),
         ("landmarks: [1, 2]", "one mapping 'landmarks'"),
@@ -101,11 +100,9 @@ def test_errors_name_invalid_links_and_positions(tmp_path):
         ("landmarks: {a: {link: b, point: 3}}", "'a': point"),
         ("landmarks: {a: {link: b, point: [0, 0, 0]}, a: 3}", "given twice"),
         ("landmarks: [", "not a YAML file"),
-    ],
-)
-def test_errors_name_the_file_and_the_entry(text, complaint, tmp_path):
-    file = tmp_path / "landmarks.yaml"
-    file.write_text(text, encoding="utf-8")
-    with pytest.raises(ModelError, match=complaint) as caught:
-        load_landmarks(tmp_path / "thing.urdf")
-    assert str(file) in str(caught.value)
+    ):
+        file = tmp_path / "landmarks.yaml"
+        file.write_text(text, encoding="utf-8")
+        with pytest.raises(ModelError, match=complaint) as caught:
+            load_landmarks(tmp_path / "thing.urdf")
+        assert str(file) in str(caught.value)

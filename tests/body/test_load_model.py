@@ -23,10 +23,8 @@ from tests.body.models import FLOATING_URDF, cube_obj, joint, link, urdf, write
 
 
 def mesh_urdf(*files, scale="1 1 1"):
-    visuals = "".join(
-        f'<visual><geometry><mesh filename="{file}" scale="{scale}"/></geometry></visual>'
-        for file in files
-    )
+    mesh = '<visual><geometry><mesh filename="{}" scale="{}"/></geometry></visual>'
+    visuals = "".join(mesh.format(file, scale) for file in files)
     return urdf(link("a", visuals), joint("j", "fixed", "world", "a", limits=None))
 
 
@@ -34,9 +32,8 @@ def test_positions_limits_and_defaults(tmp_path):
     text = FLOATING_URDF.replace('lower="-0.2" upper="0.3"', 'lower="0.1" upper="0.3"')
     model = load_model(write(tmp_path, text), check=False)
     names = dict(zip(model.position_names, range(13), strict=False))
-    assert model.position_names[:7] == tuple(
-        f"trunk_{suffix}" for suffix in ("qw", "qx", "qy", "qz", "x", "y", "z")
-    )
+    base = tuple(f"trunk_{one}" for one in ("qw", "qx", "qy", "qz", "x", "y", "z"))
+    assert model.position_names[:7] == base
     assert model.position_kinds[0] == "quaternion"
     assert model.position_kinds[names["hip"]] == "angle"
     assert model.position_kinds[names["slide"]] == "length"
@@ -95,20 +92,13 @@ def test_bundled_models_are_in_the_package_map():
         package_map({"mine": "/nowhere"})
 
 
-@pytest.mark.parametrize(
-    ("name", "content"),
-    [
-        ("a.obj", b"hello\n"),
-        ("a.obj", b""),
-        ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nvn 0 0 1\n"),
-        ("a.obj", b"v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"),
-        ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n"),
-        ("a.dae", b"<COLLADA"),
-        ("a.gltf", b"{}"),
-        ("a.glb", b"glTF"),
-        ("a.ply", b"ply\n"),
-    ],
-)
+POINTS = b"v 0 0 0\nv 1 0 0\nv 0 1 0\n"
+BROKEN: list = [b"hello\n", b"", POINTS + b"vn 0 0 1\n", POINTS + b"v 0 0 nan\nf 1 2 4\n"]
+BROKEN = [("a.obj", content) for content in (*BROKEN, POINTS + b"f 1 2 9\n")]
+BROKEN += [("a.dae", b"<COLLADA"), ("a.gltf", b"{}"), ("a.glb", b"glTF"), ("a.ply", b"ply\n")]
+
+
+@pytest.mark.parametrize(("name", "content"), BROKEN)
 def test_errors_of_broken_meshes_name_the_files(tmp_path, name, content):
     (tmp_path / name).write_bytes(content)
     with pytest.raises(ModelError, match=rf"thing\.urdf.*{name}"):
@@ -124,11 +114,9 @@ def test_drakes_warnings_are_collected_once_and_not_printed(caplog):
     assert not caplog.records
 
 
-def alias_bomb():
-    lines = ["a0: &a0 [x, x, x, x, x, x, x, x, x, x]"]
-    for level in range(1, 10):
-        lines.append(f"a{level}: &a{level} [{', '.join([f'*a{level - 1}'] * 10)}]")
-    return "\n".join(lines) + "\ndirectives: []\n"
+BOMB = "a0: &a0 [x, x, x, x, x, x, x, x, x, x]\n" + "".join(
+    f"a{level}: &a{level} [{', '.join([f'*a{level - 1}'] * 10)}]\n" for level in range(1, 10)
+)
 
 
 @pytest.mark.slow
@@ -138,7 +126,7 @@ def alias_bomb():
         ("loop.sdf", '<sdf version="1.9"><model name="m"><include><uri>package://mine/loop.sdf</uri>'
          "</include></model></sdf>"),
         ("loop.dmd.yaml", "directives:\n- add_directives:\n    file: package://mine/loop.dmd.yaml\n"),
-        ("bomb.dmd.yaml", alias_bomb()),
+        ("bomb.dmd.yaml", BOMB + "directives: []\n"),
         ("thing.urdf", mesh_urdf("cube.gltf")),
     ],
     ids=["SDFormat", "directives", "aliases", "accessor out of bounds"],
@@ -156,10 +144,7 @@ def test_files_that_crash_drake_raise_model_error(tmp_path, name, text):
 def test_report_warns_of_symmetry_and_unobserved_joints(tmp_path):
     round_ = '<visual><geometry><cylinder radius="0.1" length="0.3"/></geometry></visual>'
     text = urdf(
-        link("a"),
-        link("b"),
-        link("c", round_),
-        link("d", ""),
+        *(link("a"), link("b"), link("c", round_), link("d", "")),
         joint("lead", "revolute", "world", "a"),
         joint("follow", "revolute", "a", "b", more='<mimic joint="lead"/>'),
         joint("spin", "revolute", "b", "c", axis="0 0 1"),

@@ -30,23 +30,18 @@ def assert_tetrahedron(mesh, scale=1.0):
     assert np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0 == pytest.approx(scale**3)
 
 
-def binary_stl():
-    return tetrahedron().export(file_type="stl")
-
-
-def text_stl():
-    return tetrahedron().export(file_type="stl_ascii")
+BINARY, TEXT = (tetrahedron().export(file_type=kind) for kind in ("stl", "stl_ascii"))
 
 
 @pytest.mark.parametrize(
     "data",
     [
-        binary_stl(),
-        b"solid made by a program".ljust(80) + binary_stl()[80:],
-        text_stl().encode(),
-        text_stl().replace("solid", "solid Gelenk", 1).encode(),
-        "solid Gelenkst\xfcck\n".encode("latin-1") + text_stl().split("\n", 1)[1].encode(),
-        text_stl().replace("\n", "\r\n").upper().encode(),
+        BINARY,
+        b"solid made by a program".ljust(80) + BINARY[80:],
+        TEXT.encode(),
+        TEXT.replace("solid", "solid Gelenk", 1).encode(),
+        "solid Gelenkst\xfcck\n".encode("latin-1") + TEXT.split("\n", 1)[1].encode(),
+        TEXT.replace("\n", "\r\n").upper().encode(),
     ],
     ids=["binary", "binary solid", "text", "named", "latin1", "upper"],
 )
@@ -58,21 +53,20 @@ def test_every_variant_of_stl_is_read(tmp_path, data):
 @pytest.mark.parametrize(
     "data",
     [
-        binary_stl()[:-20],
-        binary_stl()[:80] + struct.pack("<I", 3) + binary_stl()[84:],
-        binary_stl()[:80] + struct.pack("<I", 2**31) + binary_stl()[84:],
-        b"solid".ljust(80) + struct.pack("<I", 9) + binary_stl()[84:],
-        text_stl()[: len(text_stl()) // 2].encode(),
-        text_stl().replace("vertex", "vortex", 1).encode(),
-        text_stl().replace("3.0", "3,x").encode(),
+        BINARY[:-20],
+        BINARY[:80] + struct.pack("<I", 3) + BINARY[84:],
+        BINARY[:80] + struct.pack("<I", 2**31) + BINARY[84:],
+        b"solid".ljust(80) + struct.pack("<I", 9) + BINARY[84:],
+        TEXT[: len(TEXT) // 2].encode(),
+        TEXT.replace("vertex", "vortex", 1).encode(),
+        TEXT.replace("3.0", "3,x").encode(),
         b"",
     ],
     ids=["truncated", "fewer", "more", "solid", "half text", "spoiled text", "no number", "empty"],
 )
 def test_damaged_stl_files_are_refused_by_link_and_file(tmp_path, data):
     (tmp_path / "t.stl").write_bytes(data)
-    mesh = '<visual><geometry><mesh filename="t.stl"/></geometry></visual>'
-    text = urdf(link("hand", mesh))
+    text = urdf(link("hand", '<visual><geometry><mesh filename="t.stl"/></geometry></visual>'))
     with pytest.raises(ModelError, match=r"'hand'.*t\.stl") as caught:
         load_model(write(tmp_path, text), check=False)
     assert "charset" not in str(caught.value)

@@ -11,6 +11,7 @@ from pydrake.geometry import Role
 from drake_pose.body import load_model
 from drake_pose.errors import ModelError
 from tests.body.models import link_poses, write
+from tests.body.test_meshes import tetrahedron
 
 # Two joints on one body, which Drake's own parser places wrongly.
 TWO_JOINTS = """<body name="a" pos="0 0 0.1"><joint name="x" axis="1 0 0" range="-90 90"/>
@@ -35,8 +36,9 @@ REFERENCES = """<body name="a" zaxis="0 0 -1"><joint name="r" ref="30" range="-6
 <geom size="0.1"/><body name="b" pos="0 0 1" euler="10 20 30"><joint name="s" type="slide"
 ref="0.3" range="-1 1" axis="0 2 0"/><joint name="t" ref="-20" axis="1 1 0" range="5 -5"/>
 <geom size="0.1"/></body></body>"""
+REPLICAS = """<body name="x"><replicate count="3" offset="0 0 1"><body name="b"><geom size="1"/>
+<joint name="j" range="-9 9"/></body></replicate></body>"""
 MJCF = f'<mujoco model="m">{CLASSES}<worldbody>{SLIDES}</worldbody></mujoco>'
-HALF_ROOT = np.sqrt(0.5)
 
 
 def file_of(folder, body=TWO_JOINTS, more="", attributes='model="m"'):
@@ -73,30 +75,22 @@ def assert_as_mujoco(path, model):
             np.testing.assert_allclose(X[:3, :3], data.xmat[body].reshape(3, 3), atol=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("more", "body"),
-    [
+def test_body_poses_match_mujoco(tmp_path):
+    for more, body in (
         (CLASSES, SLIDES),
         ('<compiler eulerseq="zYx"/>', FRAMES),
         ('<compiler eulerseq="XyZ"/><compiler autolimits="true"/>', REFERENCES),
-        (
-            "",
-            '<body name="x"><replicate count="3" offset="0 0 1"><body name="b"><geom size="1"/>'
-            '<joint name="j" range="-9 9"/></body></replicate></body>',
-        ),
-    ],
-    ids=["classes", "frames", "references", "replicate"],
-)
-def test_body_poses_match_mujoco(tmp_path, more, body):
-    path = file_of(tmp_path, body, more)
-    model = load_model(path, check=False)
-    assert_as_mujoco(path, model)
-    tree = model.pose_tree()
-    q = np.clip(np.full(len(model.position_names), 0.1), model.lower, model.upper)
-    places = link_poses(model, q)
-    for node, X in zip(tree.nodes, tree.node_poses(tree.values_from_positions(q)), strict=True):
-        if node.name in places:
-            np.testing.assert_allclose(X[:3, 3], places[node.name][:3, 3], atol=1e-12)
+        ("", REPLICAS),
+    ):
+        path = file_of(tmp_path, body, more)
+        model = load_model(path, check=False)
+        assert_as_mujoco(path, model)
+        tree = model.pose_tree()
+        q = np.clip(np.full(len(model.position_names), 0.1), model.lower, model.upper)
+        places = link_poses(model, q)
+        for node, X in zip(tree.nodes, tree.node_poses(tree.values_from_positions(q)), strict=True):
+            if node.name in places:
+                np.testing.assert_allclose(X[:3, 3], places[node.name][:3, 3], atol=1e-12)
 
 
 def test_meshes_of_classes_and_frames(tmp_path):
@@ -171,36 +165,26 @@ def test_collision_geometry_inertia_and_textures_are_ignored(tmp_path):
     assert model.plant.GetBodyByName("b").default_mass() == pytest.approx(8.0)
 
 
-@pytest.mark.parametrize(
-    ("asset", "corner"),
-    [
+def test_meshes_are_placed_as_in_mujoco(tmp_path):
+    for asset, corner in (
         ('file="t.stl" scale="2 1 1"', (2.0, 2.0, 3.0)),
         # Reference pose first, then scale: (0, 2, 0) - (1, 0, 0), rotated back by 90 deg, doubled.
-        (
-            f'file="t.stl" refpos="1 0 0" refquat="{HALF_ROOT} 0 0 {HALF_ROOT}" scale="2 1 1"',
-            (4.0, 1.0, 3.0),
-        ),
+        ('file="t.stl" refpos="1 0 0" refquat="1 0 0 1" scale="2 1 1"', (4.0, 1.0, 3.0)),
         ('vertex="0 0 0  1 0 0  0 2 0  0 0 3  0.1 0.1 0.1"', (1.0, 2.0, 3.0)),
-    ],
-    ids=["scale", "reference", "hull"],
-)
-def test_meshes_are_placed_as_in_mujoco(tmp_path, asset, corner):
-    corners = [[0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3]]
-    faces = [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]]
-    trimesh.Trimesh(corners, faces, process=False).export(tmp_path / "t.stl")
-    body = '<body name="a"><geom type="mesh" mesh="t"/></body>'
-    path = file_of(tmp_path, body, f'<asset><mesh name="t" {asset}/></asset>')
-    mesh = load_model(path, check=False).link_meshes["a"]
-    assert len(mesh.triangles) == 4
-    np.testing.assert_allclose(np.max(mesh.vertices, axis=0), corner, atol=1e-6)
+    ):
+        tetrahedron().export(tmp_path / "t.stl")
+        body = '<body name="a"><geom type="mesh" mesh="t"/></body>'
+        path = file_of(tmp_path, body, f'<asset><mesh name="t" {asset}/></asset>')
+        mesh = load_model(path, check=False).link_meshes["a"]
+        assert len(mesh.triangles) == 4
+        np.testing.assert_allclose(np.max(mesh.vertices, axis=0), corner, atol=1e-6)
 
 
 GEOM = '<geom size="1"/></body>'
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
+def test_errors_quote_mujocos_reason(tmp_path):
+    for text, message in (
         ('<robot name="r"><link name="a"/></robot>', "outermost element is <robot>.*name it .urdf"),
         ('<sdf version="1.7"/>', "outermost element is <sdf>"),
         ("<body>", "not well-formed XML"),
@@ -208,13 +192,11 @@ GEOM = '<geom size="1"/></body>'
         ('<flexcomp name="c" type="grid" count="2 2 2" spacing="1 1 1" dim="3"/>', "<flex> 'c'"),
         ('<body name="a" pos="1 2">' + GEOM, "'pos'.*line 1"),
         ('<attach model="s" prefix="left_"/>', "model 's'"),
-    ],
-)
-def test_errors_quote_mujocos_reason(tmp_path, text, message):
-    whole = text.startswith(("<robot", "<sdf"))
-    path = write(tmp_path, text, "m.xml") if whole else file_of(tmp_path, text)
-    with pytest.raises(ModelError, match=rf"(?s)m\.xml.*{message}"):
-        load_model(path, check=False)
+    ):
+        whole = text.startswith(("<robot", "<sdf"))
+        path = write(tmp_path, text, "m.xml") if whole else file_of(tmp_path, text)
+        with pytest.raises(ModelError, match=rf"(?s)m\.xml.*{message}"):
+            load_model(path, check=False)
 
 
 def test_missing_mujoco_names_the_extra_to_install(tmp_path, monkeypatch):

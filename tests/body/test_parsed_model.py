@@ -25,31 +25,28 @@ def one_joint(tmp_path, limits, kind="revolute", given=None, mount="fixed"):
     return load_model(write(tmp_path, text), limits=given, check=False)
 
 
-@pytest.mark.parametrize(
-    ("limits", "kind"),
-    [
+def test_limits_wider_than_four_turns_are_ignored(tmp_path):
+    for limits, kind in (
         (None, "continuous"),
         (None, "revolute"),
         ('lower="-1e16" upper="1e16"', "revolute"),
         ('lower="-10000" upper="10000"', "revolute"),
         ('lower="-12.6" upper="12.6"', "revolute"),
-    ],
-)
-def test_limits_wider_than_four_turns_are_ignored(tmp_path, limits, kind):
-    model = one_joint(tmp_path, limits, kind)
-    np.testing.assert_allclose([model.lower[0], model.upper[0]], [-math.pi, math.pi])
-    assert model.is_unlimited_angle[0]
-    about_joint = [warning for warning in model.warnings if "joint 'j'" in warning]
-    assert len(about_joint) == (limits is not None)
-    if limits is not None:
-        assert "turn freely" in about_joint[0]
-        assert f"{float(limits.split(chr(34))[3]):g} rad" in about_joint[0]
-    tree = model.pose_tree()
-    node = tree.node_index("b")
-    grid = np.degrees(tree.grid(node, math.radians(20.0))[:, 0])
-    assert len(grid) == 18
-    assert np.abs(grid).max() <= 180.0 + 1e-9
-    assert np.isinf(tree.value_limits(node)).all()
+    ):
+        model = one_joint(tmp_path, limits, kind)
+        np.testing.assert_allclose([model.lower[0], model.upper[0]], [-math.pi, math.pi])
+        assert model.is_unlimited_angle[0]
+        about_joint = [warning for warning in model.warnings if "joint 'j'" in warning]
+        assert len(about_joint) == (limits is not None)
+        if limits is not None:
+            assert "turn freely" in about_joint[0]
+            assert f"{float(limits.split(chr(34))[3]):g} rad" in about_joint[0]
+        tree = model.pose_tree()
+        node = tree.node_index("b")
+        grid = np.degrees(tree.grid(node, math.radians(20.0))[:, 0])
+        assert len(grid) == 18
+        assert np.abs(grid).max() <= 180.0 + 1e-9
+        assert np.isinf(tree.value_limits(node)).all()
 
 
 @pytest.mark.parametrize("high", [3.1, math.pi, FULL, 2.0 * FULL])
@@ -111,26 +108,21 @@ def test_given_limits_replace_those_of_the_file(tmp_path):
             one_joint(tmp_path, None, "continuous", {"j": wrong})
 
 
-@pytest.mark.parametrize(
-    ("limits", "kind", "message"),
-    [
+def test_joints_that_cannot_be_searched_are_refused_by_name(tmp_path):
+    for limits, kind, message in (
         ('lower="-1e16" upper="1e16"', "prismatic", r"joint 'j' has no limits, or limits too wide"),
         ('lower="0" upper="5000"', "prismatic", r"'j' .*limits={'j': \(low, high\)}"),
         ('upper="1"', "prismatic", r"joint 'j' has no limits"),
         ('lower="-1"', "revolute", r"joint 'j' has no limits: .*upper inf \[rad\]"),
-    ],
-)
-def test_joints_that_cannot_be_searched_are_refused_by_name(tmp_path, limits, kind, message):
-    with pytest.raises(ModelError, match=message):
-        one_joint(tmp_path, limits, kind, mount="revolute").pose_tree()
-    model = one_joint(tmp_path, limits, kind, {"j": (-0.5, 0.5)}, mount="revolute")
-    assert model.pose_tree().model.upper[model.position_index("j")] == 0.5
+    ):
+        with pytest.raises(ModelError, match=message):
+            one_joint(tmp_path, limits, kind, mount="revolute").pose_tree()
+        model = one_joint(tmp_path, limits, kind, {"j": (-0.5, 0.5)}, mount="revolute")
+        assert model.pose_tree().model.upper[model.position_index("j")] == 0.5
 
 
 def test_screw_is_not_periodic(tmp_path):
-    three_turns = JOINTS_SDF.replace(
-        "<lower>-3</lower><upper>3</upper>", "<lower>-9</lower><upper>9</upper>"
-    )
+    three_turns = JOINTS_SDF.replace(">-3</lower><upper>3<", ">-9</lower><upper>9<")
     model = load_model(write(tmp_path, three_turns, "m.sdf"), check=False)
     index = model.position_index("screw")
     assert not model.periodic[index]

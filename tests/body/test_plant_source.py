@@ -4,21 +4,8 @@ import numpy as np
 import pytest
 from pydrake.geometry import Box, SceneGraph, Sphere
 from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.multibody import tree
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import (
-    BallRpyJoint,
-    BodyIndex,
-    FixedOffsetFrame,
-    PlanarJoint,
-    PrismaticJoint,
-    QuaternionFloatingJoint,
-    RevoluteJoint,
-    RpyFloatingJoint,
-    ScrewJoint,
-    SpatialInertia,
-    UniversalJoint,
-    WeldJoint,
-)
 
 from drake_pose.body import ArticulatedModel, bundled_model, load_model
 from drake_pose.errors import ModelError
@@ -26,15 +13,15 @@ from tests.body.models import FLOATING_URDF, write
 
 AXIS = np.array([0.6, 0.0, 0.8])
 JOINTS = {
-    "weld": lambda *where: WeldJoint(*where, RigidTransform([0.1, 0.2, 0.3])),
-    "revolute": lambda *where: RevoluteJoint(*where, AXIS),
-    "prismatic": lambda *where: PrismaticJoint(*where, AXIS),
-    "screw": lambda *where: ScrewJoint(*where, AXIS, 0.3, 0.0),
-    "universal": UniversalJoint,
-    "ball_rpy": BallRpyJoint,
-    "planar": PlanarJoint,
-    "rpy_floating": RpyFloatingJoint,
-    "quaternion_floating": QuaternionFloatingJoint,
+    "weld": lambda *where: tree.WeldJoint(*where, RigidTransform([0.1, 0.2, 0.3])),
+    "revolute": lambda *where: tree.RevoluteJoint(*where, AXIS),
+    "prismatic": lambda *where: tree.PrismaticJoint(*where, AXIS),
+    "screw": lambda *where: tree.ScrewJoint(*where, AXIS, 0.3, 0.0),
+    "universal": tree.UniversalJoint,
+    "ball_rpy": tree.BallRpyJoint,
+    "planar": tree.PlanarJoint,
+    "rpy_floating": tree.RpyFloatingJoint,
+    "quaternion_floating": tree.QuaternionFloatingJoint,
 }
 
 
@@ -47,8 +34,7 @@ def new_plant():
 def body_poses(plant, q):
     context = plant.CreateDefaultContext()
     plant.SetPositions(context, q)
-    poses = plant.get_body_poses_output_port().Eval(context)
-    return np.array([pose.GetAsMatrix4() for pose in poses])
+    return [X.GetAsMatrix4() for X in plant.get_body_poses_output_port().Eval(context)]
 
 
 @pytest.mark.parametrize("kind", JOINTS)
@@ -57,13 +43,14 @@ def test_copy_of_a_plant_has_the_same_poses(kind):
     instance = plant.AddModelInstance("thing")
     ends = [plant.world_body()]
     for name in ("inner", "outer"):
-        ends.append(plant.AddRigidBody(name, instance, SpatialInertia.Zero()))
+        ends.append(plant.AddRigidBody(name, instance, tree.SpatialInertia.Zero()))
         box, grey = Box(0.1, 0.2, 0.3), np.full(4, 0.5)
         plant.RegisterVisualGeometry(ends[-1], RigidTransform(), box, name, grey)
-    plant.AddJoint(RevoluteJoint("first", ends[0].body_frame(), ends[1].body_frame(), [0, 1, 0]))
+    frames = [body.body_frame() for body in ends[:2]]
+    plant.AddJoint(tree.RevoluteJoint("first", *frames, [0, 1, 0]))
     X = RigidTransform(RollPitchYaw(0.3, 0.2, 0.1), [0.1, -0.2, 0.4])
     where = [
-        plant.AddFrame(FixedOffsetFrame(f"{body.name()}_here", body.body_frame(), X))
+        plant.AddFrame(tree.FixedOffsetFrame(f"{body.name()}_here", body.body_frame(), X))
         for body in (ends[0] if "floating" in kind else ends[1], ends[2])
     ]
     plant.AddJoint(JOINTS[kind]("second", *where))
@@ -107,17 +94,15 @@ def test_model_has_the_chosen_instances_bodies_only(tmp_path):
     # Two links have no visual geometry.
     assert made.labels < own
     assert len(made.labels) == len(made.link_meshes) == len(own) - 2
-    assert {plant.get_body(BodyIndex(k)).name() for k in own} >= {
-        name.rpartition("::")[2] for name in made.link_meshes
-    }
+    bodies = {plant.get_body(tree.BodyIndex(k)).name() for k in own}
+    assert bodies >= {name.rpartition("::")[2] for name in made.link_meshes}
     searched = {name for node in made.pose_tree().nodes for name in node.position_names}
     assert searched
     assert all(name.startswith("b_") for name in searched)
     assert len(ArticulatedModel.from_plant(plant, scene_graph).link_meshes) == 2 * len(made.labels)
     assert not made.changes_shape
-    assert {*made.link_meshes} - {*made.without(["b_::thing::leg"]).link_meshes} == {
-        "b_::thing::leg"
-    }
+    leg = "b_::thing::leg"
+    assert {*made.link_meshes} - {*made.without([leg]).link_meshes} == {leg}
 
 
 def test_unusable_plants_are_refused_by_name():

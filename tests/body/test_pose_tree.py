@@ -10,18 +10,8 @@ from drake_pose.body.root import even_rotations
 from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.errors import ModelError, SettingsError, UnknownNameError
 from drake_pose.search.estimates import PoseSet, joint_estimates
-from tests.body.models import (
-    FLOATING_URDF,
-    JOINTED_BASE_URDF,
-    JOINTS_SDF,
-    SPHERE,
-    WELDED_URDF,
-    joint,
-    link,
-    link_poses,
-    urdf,
-    write,
-)
+from tests.body import models as bodies
+from tests.body.models import SPHERE, joint, link, link_poses, urdf, write
 
 
 def largest_difference_from_drake(model, tree, *, samples=20):
@@ -44,10 +34,11 @@ def largest_difference_from_drake(model, tree, *, samples=20):
 
 @pytest.fixture(scope="module")
 def models(tmp_path_factory):
-    texts = {"floating": FLOATING_URDF, "jointed": JOINTED_BASE_URDF, "welded": WELDED_URDF}
+    texts = {"floating": bodies.FLOATING_URDF, "jointed": bodies.JOINTED_BASE_URDF}
+    texts["welded"] = bodies.WELDED_URDF
     folder = tmp_path_factory.mktemp("models")
     files = {name: write(folder, text, f"{name}.urdf") for name, text in texts.items()}
-    files["all_joints"] = write(folder, JOINTS_SDF, "all_joints.sdf")
+    files["all_joints"] = write(folder, bodies.JOINTS_SDF, "all_joints.sdf")
     return {name: load_model(file, check=False) for name, file in files.items()}
 
 
@@ -81,17 +72,13 @@ def test_links_without_geometry_and_welded_links_merge(models):
 )
 @pytest.mark.parametrize("kind", ["own", "free", "fixed", "limited"])
 def test_every_tree_matches_drake(models, name, root, kind):
-    rotation = {
-        "own": None,
-        "free": RootRotation.free(20.0),
-        "fixed": RootRotation.fixed(),
-        "limited": RootRotation.limited([("y", -170.0, 180.0), ("z", -10.0, 10.0)]),
-    }[kind]
-    tree = models[name].pose_tree(root, root_position=[0.3, 0.2, 0.1], root_rotation=rotation)
+    rotation = {"own": None, "free": RootRotation.free(20.0), "fixed": RootRotation.fixed()}
+    rotation["limited"] = RootRotation.limited([("y", -170.0, 180.0), ("z", -10.0, 10.0)])
+    at = {"root_position": [0.3, 0.2, 0.1], "root_rotation": rotation[kind]}
+    tree = models[name].pose_tree(root, **at)
     assert largest_difference_from_drake(models[name], tree, samples=4) < 1e-9
-    np.testing.assert_allclose(
-        tree.node_poses(tree.default_values())[0][:3, 3], [0.3, 0.2, 0.1], atol=1e-12
-    )
+    place = tree.node_poses(tree.default_values())[0][:3, 3]
+    np.testing.assert_allclose(place, [0.3, 0.2, 0.1], atol=1e-12)
     if root is not None:
         assert tree.nodes[0].name == root
     if name == "jointed":
@@ -184,9 +171,8 @@ HANGING = [
 ]
 
 
-@pytest.mark.parametrize(
-    ("parts", "root", "nodes"),
-    [
+def test_nodes_of_links_without_geometry_and_of_the_world(tmp_path):
+    for parts, root, nodes in (
         # A branching link without geometry is a node with an empty mesh ...
         (HAND, None, [("palm", -1), ("thumb", 0), ("finger", 0)]),
         # ... but is skipped where re-rooting makes it part of a chain.
@@ -195,20 +181,16 @@ HANGING = [
         (BESIDE, "handle", [("handle", -1), ("cup", 0), ("table", -1)]),
         # So are links attached to a world without geometry.
         (HANGING, None, [("ball", -1), ("upper", -1), ("lower", 1)]),
-    ],
-    ids=["branching", "chain", "world", "empty world"],
-)
-def test_nodes_of_links_without_geometry_and_of_the_world(tmp_path, parts, root, nodes):
-    model = loaded(tmp_path, *parts)
-    tree = model.pose_tree(root, root_position=None if root is None else [0, 0, 1])
-    assert [(node.name, node.parent) for node in tree.nodes] == nodes
-    assert [node.mesh.is_empty for node in tree.nodes] == [name == "palm" for name, _ in nodes]
-    assert largest_difference_from_drake(model, tree) < 1e-9
+    ):
+        model = loaded(tmp_path, *parts)
+        tree = model.pose_tree(root, root_position=None if root is None else [0, 0, 1])
+        assert [(node.name, node.parent) for node in tree.nodes] == nodes
+        assert [node.mesh.is_empty for node in tree.nodes] == [name == "palm" for name, _ in nodes]
+        assert largest_difference_from_drake(model, tree) < 1e-9
 
 
-@pytest.mark.parametrize(
-    ("root", "arguments", "error", "words"),
-    [
+def test_errors_of_arguments_name_the_culprit(models):
+    for root, arguments, error, words in (
         ("nose", {}, UnknownNameError, "link 'nose'.*trunk"),
         ("between", {}, ModelError, "'between' has no visual geometry"),
         (None, {"held": {"nose": 1.0}}, UnknownNameError, "joint 'nose'"),
@@ -216,11 +198,9 @@ def test_nodes_of_links_without_geometry_and_of_the_world(tmp_path, parts, root,
         (None, {"root_position": [0, 0, np.nan]}, SettingsError, "three finite"),
         (None, {"held": {"slide": np.inf}}, SettingsError, "finite number"),
         (None, {"held": {"slide": 0.4}}, SettingsError, r"'slide' .* 0\.4, outside its limits, -0"),
-    ],
-)
-def test_errors_of_arguments_name_the_culprit(models, root, arguments, error, words):
-    with pytest.raises(error, match=words):
-        models["floating"].pose_tree(root, **arguments)
+    ):
+        with pytest.raises(error, match=words):
+            models["floating"].pose_tree(root, **arguments)
 
 
 def test_invalid_grids_values_and_models_are_refused(models, tmp_path):
@@ -244,22 +224,19 @@ def test_invalid_grids_values_and_models_are_refused(models, tmp_path):
 TWENTY = np.radians(20.0)
 
 
-@pytest.mark.parametrize(
-    ("lower", "upper", "expected"),
-    [
+def test_samples_are_sorted_by_magnitude_negative_first():
+    for lower, upper, expected in (
         (-60, 60, [0, -20, 20, -40, 40, -60, 60]),
         (-100, 10, [0, -20, -40, -60, -80, -100]),
         (0, 40, [0, 20, 40]),
         (25, 35, [30]),
         (5, 5, [5]),
         (50, 110, [60, 80, 100]),
-    ],
-)
-def test_samples_are_sorted_by_magnitude_negative_first(lower, upper, expected):
-    samples = axis_samples(np.radians(lower), np.radians(upper), TWENTY, is_angle=True)
-    np.testing.assert_allclose(np.degrees(samples), expected, atol=1e-9)
-    assert min(samples) >= np.radians(lower)
-    assert max(samples) <= np.radians(upper)
+    ):
+        samples = axis_samples(np.radians(lower), np.radians(upper), TWENTY, is_angle=True)
+        np.testing.assert_allclose(np.degrees(samples), expected, atol=1e-9)
+        assert min(samples) >= np.radians(lower)
+        assert max(samples) <= np.radians(upper)
 
 
 def test_full_turn_has_each_direction_once():
@@ -278,9 +255,8 @@ def test_limited_rotation_applies_axes_in_order():
     assert rotation.value_names == ("root_y", "root_z")
 
 
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
+def test_invalid_rotations_are_refused():
+    for make, message in (
         (lambda: RootRotation.fixed(np.diag([1.0, 1.0, -1.0])), "not a 3 x 3 rotation"),
         (lambda: RootRotation.fixed(np.zeros((2, 2))), "not a 3 x 3 rotation"),
         (lambda: RootRotation.fixed(np.full((3, 3), np.nan)), "not a 3 x 3 rotation"),
@@ -288,11 +264,9 @@ def test_limited_rotation_applies_axes_in_order():
         (lambda: RootRotation.limited([("y", 10, -10)]), "lower first"),
         (lambda: RootRotation.limited([("y", 0, 1), ("y", 0, 1)]), "different"),
         (lambda: RootRotation.limited([]), "one to three"),
-    ],
-)
-def test_invalid_rotations_are_refused(make, message):
-    with pytest.raises(SettingsError, match=message):
-        make()
+    ):
+        with pytest.raises(SettingsError, match=message):
+            make()
 
 
 @pytest.mark.parametrize("name", ["floating", "jointed", "welded", "all_joints"])
@@ -330,8 +304,7 @@ def test_grids_are_all_combinations_of_their_axes(models):
         lower, upper = tree.value_bounds(k)
         axes = []
         for j in range(len(node.value_names)):
-            is_angle = bool(tree.placements[k].is_angle[j])
-            spacing = 0.9 if is_angle else 0.2
+            spacing = 0.9 if tree.placements[k].is_angle[j] else 0.2
             periodic = bool(tree.placements[k].periodic[j])
             axes.append(axis_samples(lower[j], upper[j], spacing, is_angle=periodic))
         grid = tree.grid(k, 0.9, 0.2)
@@ -407,9 +380,8 @@ def test_even_rotations_are_near_to_every_rotation_and_apart(degrees):
     found = Rotation.from_rotvec(even_rotations(interval))
     assert found[0].magnitude() == 0.0
     assert (np.diff(found.magnitude()) > -1e-8).all()
-    nearest = [
-        (found.inv() * one).magnitude().min() for one in Rotation.random(300, random_state=1)
-    ]
+    drawn = Rotation.random(300, random_state=1)
+    nearest = [(found.inv() * one).magnitude().min() for one in drawn]
     assert max(nearest) < 0.95 * interval
     assert len(found) == pytest.approx(8.0 * np.pi**2 / interval**3, rel=0.3)
     apart = [np.sort((found.inv() * one).magnitude())[1] for one in found[::7]]

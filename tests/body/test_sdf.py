@@ -72,32 +72,21 @@ def test_warnings_name_couplings_gearboxes_and_loops(tmp_path):
     assert "joint 'two' closes a loop of links at 'c'" in warnings
 
 
-@pytest.mark.parametrize(
-    ("text", "named"),
-    [
+PAIR, OWN = link("a") + link("b"), "<mesh><uri>thing.sdf</uri>{}</mesh>"
+
+
+def test_refusals_name_link_or_joint(tmp_path):
+    for text, named in (
         (sdf(link("a", "<sphere><radius>-1</radius></sphere>")), "link 'a': radius of its sphere"),
-        (sdf(link("a", "<box><size>0 1 1</size></box>")), "link 'a': size of its box"),
         (sdf(link("a", "<cylinder><radius>x</radius></cylinder>")), "link 'a': radius of its cyl"),
         (sdf(link("a", "<cone><radius>1</radius></cone>")), "link 'a': there is no shape <cone>"),
         (sdf(link("a", "<mesh><uri>gone.stl</uri></mesh>")), "link 'a': mesh 'gone.stl'"),
         (sdf(link("a", "<mesh/>")), "link 'a': a mesh without a <uri>"),
-        (
-            sdf(link("a", "<mesh><uri>thing.sdf</uri><submesh><name>x</name></submesh></mesh>")),
-            "link 'a': Drake shows the whole mesh",
-        ),
-        (
-            sdf(link("a", "<mesh><uri>thing.sdf</uri><scale>1 0 1</scale></mesh>")),
-            "link 'a': scale of mesh",
-        ),
+        (sdf(link("a", OWN.format("<submesh/>"))), "link 'a': Drake shows the whole mesh"),
+        (sdf(link("a", OWN.format("<scale>1 0 1</scale>"))), "link 'a': scale of mesh"),
         (sdf(link("a", more="<pose>0 0 x 0 0 0</pose>")), "link 'a': its <pose> is '0 0 x"),
-        (
-            sdf(link("a"), link("b"), joint("e", "a", "b", LIMITS.replace("-1", "2"))),
-            "joint 'e': lower limit 2 is above upper limit 1",
-        ),
-        (
-            sdf(link("a"), link("b"), joint("e", "a", "b").replace("0 0 1", "0 0 0")),
-            "joint 'e': its axis is zero",
-        ),
+        (sdf(PAIR, joint("e", "a", "b", LIMITS.replace("-1", "2"))), "joint 'e': lower limit 2"),
+        (sdf(PAIR, joint("e", "a", "b").replace("0 0 1", "0 0 0")), "joint 'e': its axis is zero"),
         (sdf(link("a"), joint("e", "a", "b")), "specified by joint with name[e] not found"),
         (sdf(link("a"), link("a")), "Non-unique name[a]"),
         (sdf(link("a")).replace(' version="1.9"', ""), "<sdf> has no version"),
@@ -105,10 +94,8 @@ def test_warnings_name_couplings_gearboxes_and_loops(tmp_path):
         (sdf("<include><uri>model://nowhere</uri></include>"), "--package nowhere=FOLDER"),
         (sdf("<include/>"), "an <include> without a <uri>"),
         ("<robot/>", "its outermost element is <robot>"),
-    ],
-)
-def test_refusals_name_link_or_joint(tmp_path, text, named):
-    assert named in refusal(tmp_path, text, "thing.sdf")
+    ):
+        assert named in refusal(tmp_path, text, "thing.sdf")
 
 
 def test_included_models_are_sanitised(tmp_path):
@@ -171,9 +158,8 @@ def test_models_of_directives_are_sanitised(tmp_path):
     np.testing.assert_allclose(crate[:, 0], [0.0, 1.0, 0.0], atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("text", "named"),
-    [
+def test_refusals_of_directives_name_the_file(tmp_path):
+    for text, named in (
         (directives("- add_model: {name: a, file: package://drake_models/a.urdf}"), "--package"),
         (directives("- add_model: {name: a, file: gone.urdf}"), "add_model 'gone.urdf'"),
         (directives("- add_directives: {file: all.dmd.yaml}"), "includes itself"),
@@ -181,13 +167,11 @@ def test_models_of_directives_are_sanitised(tmp_path):
         (directives("- bogus: {}"), "bogus"),
         ("", "it is empty"),
         ("a: [", "it is not YAML"),
-    ],
-)
-def test_refusals_of_directives_name_the_file(tmp_path, text, named):
-    sphere = '<visual><geometry><sphere radius="-1"/></geometry></visual>'
-    write(tmp_path, urdf_file(urdf_link("a", sphere)), "bad.urdf")
-    path = write(tmp_path, text, "all.dmd.yaml")
-    with pytest.raises(ModelError) as caught:
-        load_model(path, check=False)
-    assert named in str(caught.value)
-    assert ("bad.urdf" if "bad.urdf" in text else "all.dmd.yaml") in str(caught.value)
+    ):
+        sphere = '<visual><geometry><sphere radius="-1"/></geometry></visual>'
+        write(tmp_path, urdf_file(urdf_link("a", sphere)), "bad.urdf")
+        path = write(tmp_path, text, "all.dmd.yaml")
+        with pytest.raises(ModelError) as caught:
+            load_model(path, check=False)
+        assert named in str(caught.value)
+        assert ("bad.urdf" if "bad.urdf" in text else "all.dmd.yaml") in str(caught.value)

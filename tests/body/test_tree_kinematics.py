@@ -9,21 +9,13 @@ from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.errors import ModelError, SettingsError
 from tests.body.models import FLOATING_URDF, JOINTED_BASE_URDF, JOINTS_SDF, WELDED_URDF, write
 
+_TURNED = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
+_LIMITED = RootRotation.limited([("y", -90, 90), ("z", -20, 30)], rotation=_TURNED)
+_LEG = {"root": "leg", "root_position": (0.0, 0.2, 0.0), "root_rotation": _LIMITED}
 _TREES = {
     "floating": (FLOATING_URDF, "f.urdf", {"root_position": (0.3, -0.2, 0.9)}),
     "re-rooted": (FLOATING_URDF, "f.urdf", {"root": "hand", "root_position": (0.3, 0.2, 0.1)}),
-    "re-rooted, limited": (
-        FLOATING_URDF,
-        "f.urdf",
-        {
-            "root": "leg",
-            "root_position": (0.0, 0.2, 0.0),
-            "root_rotation": RootRotation.limited(
-                [("y", -90, 90), ("z", -20, 30)],
-                rotation=[[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]],
-            ),
-        },
-    ),
+    "re-rooted, limited": (FLOATING_URDF, "f.urdf", _LEG),
     "jointed base": (JOINTED_BASE_URDF, "j.urdf", {}),
     "known root": (JOINTED_BASE_URDF, "j.urdf", {"root_position": (1.0, 2.0, 3.0)}),
     "welded": (WELDED_URDF, "w.urdf", {}),
@@ -102,15 +94,11 @@ def test_translation_and_scale_move_the_first_roots_tree(kinematics):
         assert np.allclose(move(motions, m + k, points)[0], np.eye(3)[k])
     scaling = move(motions, m + 3, points)[0]
     assert np.allclose(scaling, points[0] - motions.X_WN[0, :3, 3])
-    assert motions.moves[:, m:].any(axis=1).tolist() == [
-        _root_of(kinematics.tree, i) == 0 for i in range(len(motions.X_WN))
-    ]
-
-
-def _root_of(tree, node):
-    while tree.nodes[node].parent >= 0:
-        node = tree.nodes[node].parent
-    return node
+    # Parents come first.
+    roots: list[int] = []
+    for i, node in enumerate(kinematics.tree.nodes):
+        roots.append(i if node.parent < 0 else roots[node.parent])
+    assert motions.moves[:, m:].any(axis=1).tolist() == [root == 0 for root in roots]
 
 
 def test_wrong_numbers_of_values_are_refused(kinematics):

@@ -85,6 +85,17 @@ def write_video(
     return path
 
 
+def write_film(path: Path, pictures: Sequence[np.ndarray], rate: float) -> Path:
+    """Write a grey video of images (H, W) with a rate [Hz], each compressed by itself."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    kind = cv2.VideoWriter.fourcc(*"MJPG")
+    writer = cv2.VideoWriter(str(path), kind, rate, pictures[0].shape[::-1])
+    for picture in pictures:
+        writer.write(np.dstack([picture.astype(np.uint8)] * 3))
+    writer.release()
+    return path
+
+
 def write_table(path: Path, columns: Mapping[str, Any]) -> None:
     """Write a parquet table of columns by name."""
     import pyarrow.parquet

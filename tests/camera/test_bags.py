@@ -130,18 +130,16 @@ def test_hand_camera_and_joints_of_two_publishers(tmp_path, kind):
     np.testing.assert_allclose(side.times - hand.times, 0.01, rtol=0, atol=1e-6)
     order = [*range(COUNT), 3, 3, 11, 0, 1]
     assert [number_of(side.read(k)) - 100 for k in order] == order
-    np.testing.assert_array_equal(
-        [hand.read_recorded(k) for k in order], [numbered(k) for k in order]
-    )
+    recorded = [hand.read_recorded(k) for k in order]
+    np.testing.assert_array_equal(recorded, [numbered(k) for k in order])
     undistorted = cv2.undistort(numbered(5), K, np.array(PLUMB), None, hand.lens.undistorted_matrix)
     np.testing.assert_array_equal(hand.read(5), undistorted)
     assert hand.link == "hand"
     np.testing.assert_allclose(hand.camera.X_WC, pose(1) @ pose(2), rtol=0, atol=1e-9)
     assert (joints.names, joints.positions.shape) == (("elbow", "wrist", "finger"), (60, 3))
     np.testing.assert_allclose(joints.positions[:, 0], 0.5 * np.arange(60))
-    np.testing.assert_allclose(
-        joints.positions[1:58, 2], 0.02 * np.arange(1, 58), rtol=0, atol=1e-5
-    )
+    finger = joints.positions[1:58, 2]
+    np.testing.assert_allclose(finger, 0.02 * np.arange(1, 58), rtol=0, atol=1e-5)
     warnings = "\n".join(episode.warnings)
     assert "/other: also has joint elbow of /joint_states" in warnings
     assert "/side/compressed: no calibration in /camera_info" in warnings
@@ -200,9 +198,8 @@ def test_images_of_all_encodings_are_decoded(tmp_path):
         assert np.abs(found - picture)[:, 2:-2].max() < 5, name
     bayer = [episode.camera(f"bayer{big}").read(0) for big in (0, 1)]
     np.testing.assert_array_equal(*bayer)
-    np.testing.assert_array_equal(
-        bayer[0][5:60, 5:60, 1], cv2.cvtColor(mosaic, cv2.COLOR_BayerRGGB2RGB)[5:60, 5:60, 1]
-    )
+    green = cv2.cvtColor(mosaic, cv2.COLOR_BayerRGGB2RGB)[5:60, 5:60, 1]
+    np.testing.assert_array_equal(bayer[0][5:60, 5:60, 1], green)
     assert not {"16UC1", "yuv444", "mono16"} & set(episode.cameras)
     warnings = "\n".join(episode.warnings)
     assert "/yuv444 is left out: 'yuv444' is not one of rgb8, bgr8" in warnings
@@ -214,12 +211,7 @@ def test_images_of_all_encodings_are_decoded(tmp_path):
 
 def test_formats_of_compressed_pictures(tmp_path):
     bag = Bag(tmp_path, "mcap")
-    formats = (
-        "jpeg",
-        "rgb8; jpeg compressed bgr8",
-        "bgr8; jpeg compressed bgr8",
-        "bayer_rggb8; jpeg compressed bgr8",
-    )
+    formats = ["jpeg", *(f"{one}; jpeg compressed bgr8" for one in ("rgb8", "bgr8", "bayer_rggb8"))]
     mosaic = numbered(3)[:, :, 1]
     with bag.writer:
         bag.joints("/joint_states", 0.0, x=0.0)
@@ -230,9 +222,8 @@ def test_formats_of_compressed_pictures(tmp_path):
         bag.compressed("/film/compressed", 0.0, 3, "h264", np.zeros(99, np.uint8))
     episode = open_episode(bag.path)
     assert [number_of(episode.camera(f"a{k}").read(0)) for k in range(4)] == [3] * 4
-    np.testing.assert_array_equal(
-        episode.camera("raw").read(0), cv2.cvtColor(mosaic, cv2.COLOR_BayerRGGB2RGB)
-    )
+    expected = cv2.cvtColor(mosaic, cv2.COLOR_BayerRGGB2RGB)
+    np.testing.assert_array_equal(episode.camera("raw").read(0), expected)
     assert "camera 'film' is left out" in (text := "\n".join(episode.warnings))
     assert "not a PNG or JPEG picture (its format is 'h264')" in text
 
@@ -253,26 +244,21 @@ def test_positions_without_names_and_names_in_any_order(tmp_path, kind):
                 if case == "both":
                     bag.joints("/named", 0.1 * k, elbow=0.1 * k, wrist=-1.0)
                 if case == "order":
-                    pair = {"elbow": 0.1 * k, "wrist": -1.0}
-                    bag.joints(
-                        "/joint_states", 0.1 * k, **dict([*pair.items()][:: 1 - 2 * (k % 2)])
-                    )
+                    pair = [("elbow", 0.1 * k), ("wrist", -1.0)][:: 1 - 2 * (k % 2)]
+                    bag.joints("/joint_states", 0.1 * k, **dict(pair))
         episode = open_episode(bag.path)
         texts, joints = "\n".join(episode.warnings), episode.joints
         if case in ("two", "none"):
             assert joints is None
             assert "Wanted is a topic of sensor_msgs/JointState with names" in texts
-            assert ("/others is left out: its JointState has 3 positions" in texts) == (
-                case == "two"
-            )
+            assert ("/others: its JointState has no names: its 3" in texts) == (case == "two")
             continue
         expected = ("joint_0", "joint_1") if case == "bare" else ("elbow", "wrist")
         assert joints.names == expected
         np.testing.assert_allclose(joints.positions, [[0.1 * k, -1.0] for k in range(COUNT)])
-        assert ("2 positions are taken for joints in the model's order" in texts) == (
-            case == "bare"
-        )
-        assert ("2 positions without names" in texts) == (case == "both")
+        taken = "2 positions are taken for joints in the model's order" in texts
+        assert taken == (case == "bare")
+        assert ("2 positions are left out" in texts) == (case == "both")
 
 
 @pytest.mark.parametrize(
@@ -288,7 +274,7 @@ def test_positions_without_names_and_names_in_any_order(tmp_path, kind):
         (0.0, np.nan, 0.0, "/joint_states: rows of x: headers without time stamps"),
     ],
 )
-def test_clocks_of_headers_that_differ_are_moved_by_the_times_of_recording(
+def test_clocks_of_headers_are_moved_by_the_times_of_recording(
     tmp_path, camera, joint, later, text
 ):
     bag = Bag(tmp_path, "mcap")
@@ -345,6 +331,19 @@ def test_folders_of_several_bags_are_refused(tmp_path):
         open_episode(tmp_path)
 
 
+def test_files_outside_the_folder_are_not_opened(tmp_path):
+    bag = Bag(tmp_path, "mcap")
+    with bag.writer:
+        bag.image("/a", 0.0, numbered(1), "rgb8")
+    text, file = (bag.path / "metadata.yaml").read_text(), next(bag.path.glob("*.mcap"))
+    # A path of the recorder's machine is that of the file in this folder.
+    (bag.path / "metadata.yaml").write_text(text.replace(file.name, f"../bags/{file.name}"))
+    assert list(open_episode(bag.path).cameras) == ["a"]
+    file.rename(tmp_path / file.name)
+    with pytest.raises(SceneError, match=r"metadata\.yaml: relative_file_paths: '\.\./bags/.* lea"):
+        open_episode(bag.path)
+
+
 def test_images_are_undistorted_by_their_lens_models(tmp_path):
     bag, P = Bag(tmp_path, "mcap"), [50, 0, 30, 0, 0, 51, 29, 0, 0, 0, 1, 0]
     rational = (-0.3, 0.1, 1e-3, -2e-3, 0.01, 0.05, 0.02, 0.003)
@@ -385,7 +384,7 @@ def test_odd_and_truncated_bags(tmp_path, kind):
     np.testing.assert_allclose(one.times - 1.7e9, 0.1 * np.array(kept), rtol=0, atol=1e-6)
     assert [number_of(one.read(k)) for k in range(len(kept))] == kept
     assert ("/a: pictures: headers without time stamps" in warnings) == (kind == "sqlite3")
-    assert ("/a: pictures: number 5" in warnings) == (kind != "sqlite3")
+    assert ("camera 'a': pictures: number 5" in warnings) == (kind != "sqlite3")
     assert ("its clock differs from the joint log's" in warnings) == (kind == "mcap")
     file = next(p for p in (bag.path, *bag.path.glob("*")) if p.suffix in (".bag", ".db3", ".mcap"))
     assert list(open_episode(file).cameras) == ["a"]
@@ -399,7 +398,5 @@ def test_a_bag_without_images_lists_its_topics(tmp_path):
     with bag.writer:
         bag.image("/depth", 0.0, np.zeros((4, 4, 2), np.uint8), "16UC1")
         bag.joints("/joint_states", 0.0, x=0.0)
-    with pytest.raises(
-        SceneError, match=r"no pictures .*: /depth \(depths\), /joint_states \(sens"
-    ):
+    with pytest.raises(SceneError, match=r"no pictures .*: /depth \(depths\), /joint_states \(sen"):
         open_episode(bag.path)

@@ -1,11 +1,14 @@
-"""LeRobot data sets (2.1, 3.0) and DROID folders, written as by their recorders."""
+"""LeRobot data sets (2.1, 3.0) and DROID folders, and times and poses as they record them."""
 
 import json
 
 import numpy as np
+import pyarrow
 import pytest
+from scipy.spatial.transform import Rotation
 
-from drake_pose.camera.episode_files import open_episode
+from drake_pose.camera.episode_files import open_episode, recorded_pose
+from drake_pose.camera.lerobot_tables import is_picture, row_times
 from drake_pose.errors import SceneError, UnknownNameError
 from tests.camera.recordings import number_of, png, write_table, write_video
 
@@ -56,9 +59,8 @@ def write_v30(folder):
         where = V3.format(chunk_index=0, video_key="", file_index=file)
         write_table(folder / f"data/{where}.parquet", rows_of(*own))
     numbers = [20 * n + k for n, count in LENGTHS.items() for k in range(count)]
-    write_video(
-        folder / f"videos/{V3.format(chunk_index=0, video_key=TOP, file_index=0)}.mp4", numbers
-    )
+    where = V3.format(chunk_index=0, video_key=TOP, file_index=0)
+    write_video(folder / f"videos/{where}.mp4", numbers)
     # LeRobot sums rounded durations.
     begin = np.cumsum([0, *LENGTHS.values()]) * 0.1 + 1e-7
     times = {"from_timestamp": begin[:-1], "to_timestamp": begin[1:]}
@@ -215,3 +217,69 @@ def test_extrinsics_without_intrinsics_are_named(tmp_path):
     assert len(texts) == 1
     assert texts[0].startswith("camera '222_right': its recorded extrinsics are not used, as ")
     assert "trajectory.h5 has no camera_intrinsics/222_right" in texts[0]
+
+
+@pytest.mark.parametrize("stretch", [0.5, 0.75, 1.3, 2.0])
+def test_times_at_another_rate_are_used_and_told(stretch) -> None:
+    times, warnings = stretch * (3.0 + 0.1 * np.arange(9)), []
+    found = row_times(pyarrow.table({"timestamp": times}), 10.0, "a.parquet", warnings)
+    np.testing.assert_allclose(found, times)
+    (text,) = warnings
+    assert f"the rows' times are {0.1 * stretch:.4g} s apart, but at 10 Hz" in text
+    assert "would be 0.1 s" in text
+
+
+def test_colour_images_are_told_from_depth_and_numbers():
+    for key, kind, more, found in (
+        ("observation.image", ("image", [4, 4, 3]), {}, True),
+        ("observation.images.top", ("video", [4, 4, 3]), {}, True),
+        ("top", ("uint8", [4, 4, 3]), {}, True),
+        ("top", ("uint8", [3, 4, 4]), {}, True),
+        ("depth", ("uint16", [4, 4, 1]), {}, False),
+        ("depth", ("uint16", [1, 4, 4]), {}, False),
+        ("top", ("video", [4, 4, 3]), {"info": {"video.is_depth_map": True}}, False),
+        ("top", ("video", [4, 4, 3]), {"info": {"video.is_depth_map": False}}, True),
+        ("state", ("float32", [7]), {}, False),
+    ):
+        assert is_picture(key, {"dtype": kind[0], "shape": kind[1], **more}) == found
+
+
+def test_a_recorded_pose_is_the_median_of_rows_as_droid_writes_them() -> None:
+    """Position, and angles about the fixed axes x, y and z; half a turn is no jump."""
+    rng, warnings = np.random.default_rng(2), []
+    row = np.array([0.3, -0.2, 0.5, 3.14159, 0.2, -1.1])
+    rows = row + 1e-4 * rng.normal(size=(31, 6))
+    rows[:, 3] = np.mod(rows[:, 3] + np.pi, 2.0 * np.pi) - np.pi
+    assert np.ptp(rows[:, 3]) > 6.0
+    found = recorded_pose(rows, "eye", warnings)
+    assert found is not None
+    assert warnings == []
+    turn = np.eye(3)
+    for axis, angle in zip("xyz", row[3:], strict=True):
+        turn = Rotation.from_euler(axis, angle).as_matrix() @ turn
+    np.testing.assert_allclose(found[:3, :3], turn, atol=2e-4)
+    np.testing.assert_allclose(found[:3, 3], row[:3], atol=2e-4)
+    np.testing.assert_array_equal(found[3], [0, 0, 0, 1])
+    rows[:3] += 0.5
+    again = recorded_pose(rows, "eye", warnings)
+    np.testing.assert_allclose(again, found, atol=1e-4)
+    assert "vary by 500 mm and 28.7 degrees; their median is used" in warnings[0]
+    (single,) = [recorded_pose(row, "eye", [])]
+    np.testing.assert_allclose(single, found, atol=3e-4)
+
+
+@pytest.mark.parametrize(
+    ("rows", "told"),
+    [
+        (np.zeros((3, 5)), "are not x, y, z"), (np.full((3, 6), np.nan), "are not x, y, z"),
+        (np.array([[0.0] * 6, [0.004] * 6]), None),
+        (np.array([[0.0] * 6, [0.006] + [0.0] * 5]), "vary by 6 mm and 0.0 degrees"),
+        (np.array([[0.0] * 6, [0.0] * 5 + [0.006]]), "vary by 0 mm and 0.3 degrees"),
+    ],
+)  # fmt: skip
+def test_useless_or_moving_poses_are_told(rows, told) -> None:
+    warnings: list[str] = []
+    found = recorded_pose(rows, "eye", warnings)
+    assert (found is None) == (told is not None and "not x" in told)
+    assert len(warnings) == (told is not None)
+    assert all(f"camera 'eye': its recorded extrinsics {told}" in text for text in warnings)

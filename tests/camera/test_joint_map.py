@@ -8,14 +8,8 @@ import pytest
 
 from drake_pose.camera.episode import JointLog
 from drake_pose.camera.episode_files import open_episode
-from drake_pose.camera.joint_map import (
-    Column,
-    follower_warnings,
-    map_joints,
-    match_names,
-    read_joint_map,
-    without_followers,
-)
+from drake_pose.camera.joint_map import Column, map_joints, match_names, read_joint_map
+from drake_pose.camera.servo_readings import Servos
 from drake_pose.errors import SceneError, SettingsError, UnknownNameError
 
 LOW = np.array([-2.9, -1.8, -2.9, -3.1, -2.9, -0.1, -2.9])
@@ -24,16 +18,15 @@ ARM = {"names": tuple(f"panda_joint{k}" for k in range(1, 8)), "lower": LOW, "up
 POSES = np.array([[0.1, -0.5, 0.3, -2.4, 0.2, 2.0, 0.7], [0.2, -0.4, 0.1, -2.0, 0.1, 1.5, 0.9]])
 
 
-def map_log(logged, readings, model, **more):
+def map_log(logged, readings, model, servos=None, frames=(), **more):
     readings = np.array(readings, dtype=float)
-    log = JointLog(logged, 0.1 * np.arange(len(readings)), readings)
+    log = JointLog(logged, 0.1 * np.arange(len(readings)), readings, frames, servos)
     is_angle = [not name.startswith("slide") for name in model["names"]]
     return map_joints(log, **model, is_angle=np.array(is_angle), **more)
 
 
-@pytest.mark.parametrize(
-    ("logged", "wanted", "found"),
-    [
+def test_names_are_matched():
+    for logged, wanted, found in (
         ("b a", "a b", [1, 0]),
         ("Shoulder-Pan elbow.pos", "shoulder_pan elbow", [0, 1]),
         ("kLeftElbow kRightElbow", "right_elbow_joint left_elbow_joint", [1, 0]),
@@ -51,15 +44,14 @@ def map_log(logged, readings, model, **more):
         ("joint_0 joint_1", "a1 a2 a3 finger", [None, None]),
         ("joint_0 joint_1", "left_1 right_1 finger", [None, None]),
         ("m0 m1 finger", "a1 a2 finger", [0, 1, 2]),
-    ],
-)
-def test_names_are_matched(logged, wanted, found):
-    names, joints = logged.split(), wanted.split()
-    expected = {a: joints[k] for a, k in zip(names, found, strict=True) if k is not None}
-    matched, warnings = match_names(names, joints)
-    assert matched == expected
-    if "0" in logged and expected:
-        assert all(f"{a} for {b}" in warnings[0] for a, b in expected.items() if a != b)
+        ("joint_0.pos joint_1.pos joint_2.pos", "joint_0 joint_1 left_carriage", [0, 1, 2]),
+    ):
+        names, joints = logged.split(), wanted.split()
+        expected = {a: joints[k] for a, k in zip(names, found, strict=True) if k is not None}
+        matched, warnings = match_names(names, joints)
+        assert matched == expected
+        if "0" in logged and expected:
+            assert all(f"{a} for {b}" in warnings[0] for a, b in expected.items() if a != b)
 
 
 def test_positions_have_the_models_order_and_missing_joints_are_reported():
@@ -67,80 +59,24 @@ def test_positions_have_the_models_order_and_missing_joints_are_reported():
     names = ("gripper", *(f"joint{k + 1}" for k in order))
     found = map_log(names, np.column_stack([[0.5, 0.6], POSES[:, order]]), ARM)
     expected = np.where(np.arange(7) == 4, np.nan, POSES)
-    np.testing.assert_array_equal(found.log.positions, expected)
-    np.testing.assert_allclose(found.log.at(np.array([0.05]))[0, 0], 0.15)
+    np.testing.assert_array_equal(found.positions, expected)
+    np.testing.assert_allclose(found.at(np.array([0.05]))[0, 0], 0.15)
     assert found.not_logged == ("panda_joint5",)
-    assert found.warnings[-2:] == (
-        "joints that are not logged: panda_joint5; hold them (--hold) or map columns to them "
-        "(joint map)",
-        "columns of the joint log that are not joints: gripper",
-    )
+    assert found.warnings[-1] == "columns of the joint log that are not joints: gripper"
     with pytest.raises(SceneError, match=r"its columns are x, y, the joints panda_joint1,"):
         map_log(("x", "y"), np.zeros((2, 2)), ARM)
 
 
-def test_units_are_given_or_inferred_from_the_limits():
-    names, degrees = ARM["names"], np.rad2deg(POSES)
-    wide = ARM | {"lower": np.full(7, -3.0), "upper": np.full(7, 3.0)}
-    holes = np.where(np.eye(2, 7, dtype=bool), np.nan, POSES)
-    swings = POSES * [[1.0], [0.5]]
-    for readings, model, units, message in (
-        (POSES, ARM, None, None),
-        (holes, ARM, None, None),
-        (degrees, ARM, None, "in deg: only as degrees"),
-        (POSES, wide, None, "in rad: but as degrees they would be within"),
-        # No robot is recorded that moves by 1.2 degrees.
-        (swings, wide, None, None),
-        (POSES, ARM, "rad", None),
-        (degrees, ARM, "deg", None),
-    ):
-        found = map_log(names, readings, model, units=units)
-        expected = POSES if readings is degrees else readings
-        np.testing.assert_allclose(found.log.positions, expected, atol=1e-12)
-        assert message in found.warnings[0] if message else found.warnings == ()
-    # Readings 0.3 rad beyond a limit do not suffice to infer degrees.
-    beyond = [[3.3, *np.zeros(6)]]
-    with pytest.raises(
-        SceneError, match=r"'panda_joint1' is 3\.3 to 3\.3.*and not clearly degrees"
-    ):
-        map_log(names, beyond, wide)
-    warning = map_log(names, beyond, wide, units="rad").warnings[0]
-    assert "joint 'panda_joint1': column 'panda_joint1' gives 3.3 in row 0" in warning
-    # A single column in degrees is named, unless somebody says that all are.
-    poses = np.random.default_rng(1).uniform(0.8 * LOW, 0.8 * HIGH, (9, 7))
-    mixed = poses * np.where(np.arange(7) == 2, np.degrees(1.0), 1.0)
-    with pytest.raises(
-        SceneError, match=r"columns panda_joint3 are in degrees, but .*panda_joint4"
-    ):
-        map_log(names, mixed, ARM)
-    by_map = {names[2]: Column(names[2], np.radians(1.0))}
-    found = map_log(names, mixed, ARM, table=by_map).log.positions
-    np.testing.assert_allclose(found, poses)
-    with pytest.raises(
-        SettingsError, match="units must be rad or deg or normalised or steps, not 'turns'"
-    ):
-        map_log(names, POSES, ARM, units="turns")
-
-
-def test_normalised_readings_need_a_range():
+def test_joint_maps_and_given_units_decide():
+    with pytest.raises(SettingsError, match="units must be rad or deg or normalised or steps, not"):
+        map_log(ARM["names"], POSES, ARM, units="turns")
     limits = {"lower": np.full(2, -1.92), "upper": np.full(2, 1.92)}
     model, names = {"names": ("pan", "lift"), **limits}, ("main_pan", "main_lift", "claw")
-    # As degrees all would be within the limits of 110 degrees.
-    for columns, readings in (
-        (names, [[-99.5, 3.0, 1.0], [40.0, 9.0, 2.0]]),
-        (names, [[-60.0, 3.0, 1.0], [40.0, 9.0, 100.0]]),
-        (("pan.pos", "lift.pos"), [[-40.0, 3.0], [40.0, 9.5]]),
-    ):
-        with pytest.raises(SceneError, match=r"normalised.*give units.*from: \[-100, 100\]"):
-            map_log(columns, readings, model)
     pan = Column("main_pan", 0.0192, 0.0, (-100.0, 100.0))
     table = {"pan": pan, "lift": Column("main_lift", 0.01)}
     found = map_log(names, [[-100.0, 3.0, 0], [50.0, 2.0, 0], [100.0, 0, 0]], model, table=table)
-    np.testing.assert_allclose(found.log.positions[:, 0], [-1.92, 0.96, 1.92])
+    np.testing.assert_allclose(found.positions[:, 0], [-1.92, 0.96, 1.92])
     np.testing.assert_array_equal(found.clipped, [[True, False], [False, False], [True, False]])
-    beside = map_log(names[:2], [[-100.0, 1.0]], {**model, "names": ("pan", "main_lift")},
-                    table={"pan": pan}).warnings[0]  # fmt: skip
-    assert "to be in rad" in beside
     warnings = map_log(names, [[-101.0, 3.0, 0.0]], model, table=table).warnings[0]
     assert "joint 'pan': column 'main_pan' has 1 of 1 readings outside the joint map's" in warnings
 
@@ -150,7 +86,7 @@ def test_a_joint_without_limits_is_unwrapped():
     read = np.arctan2(np.sin(turning), np.cos(turning))[:, None]
     read[7] = turning[7] = np.nan
     model = {"names": ("wheel",), "lower": np.array([-np.inf]), "upper": np.array([np.inf])}
-    found = map_log(("wheel",), read, model).log.positions[:, 0]
+    found = map_log(("wheel",), read, model).positions[:, 0]
     np.testing.assert_allclose(found, turning, atol=1e-12)
 
 
@@ -168,7 +104,7 @@ def test_joint_maps_are_read_and_applied(tmp_path):
     readings = [[90.0, 0.5, 50.0, 250.0], [-45.0, 1.0, 100.0, 0.0]]
     found = map_log(log, readings, model, table=read_joint_map(path))
     expected = [[-0.96, 0.5, math.pi / 2, 0.25], [-1.92, 0.9, -math.pi / 4, 0.0]]
-    np.testing.assert_allclose(found.log.positions, expected, atol=1e-12)
+    np.testing.assert_allclose(found.positions, expected, atol=1e-12)
     assert found.clipped.tolist() == [[False] * 4, [True, False, False, False]]
     assert found.warnings == ()
     for text, message in (
@@ -191,38 +127,111 @@ def test_joint_maps_are_read_and_applied(tmp_path):
             map_log(ARM["names"], POSES, ARM, table=table)
 
 
-@pytest.mark.parametrize(("units", "unit"), [("rad", 1.0), ("deg", math.pi / 180.0)])
-def test_columns_of_followers_are_compared_with_the_joint_s(units, unit):
-    model = {"names": ("lead",), "lower": np.array([-1.0]), "upper": np.array([1.0])}
-    followers = {"same": Column("lead"), "mirror": Column("lead", -0.5, 0.2)}
-    lead = np.array([0.1, 0.6, 0.3])
-    columns = {"same": lead, "mirror": 0.2 - 0.5 * lead, "lead": lead}
+RNG = np.random.default_rng(5)
+WIDE = {"names": ("j1", "j2", "j3"), "lower": np.full(3, -2.8), "upper": np.full(3, 2.8)}
+SWING = np.column_stack([np.linspace(-a, b, 40) for a, b in ((0.7, 1.6), (0.2, 1.1), (0.8, 0.7))])
+SWING += 0.001 * RNG.normal(size=SWING.shape)
+HELD, HOLES = 0.2 * SWING, np.where(np.arange(40)[:, None] % 9 == [0, 1, 2], np.nan, SWING)
+STEP, JOINTS = 2.0 * np.pi / 4096, WIDE["names"]
+DEG, LEROBOT, SO = np.degrees(1.0), Servos(), Servos("so101_follower")
+POS = ("j1.pos", "j2.pos", "j3.pos")
 
-    def warnings(names=("same", "mirror", "lead"), **changed):
-        readings = np.column_stack([(columns | changed)[name] for name in names]) / unit
-        log = JointLog(names, 0.1 * np.arange(3), readings)
-        alone = without_followers(log, followers)
-        assert alone.names == ("lead",)
-        found = map_log(alone.names, alone.positions, model, units=units)
-        assert found.warnings == ()
-        return follower_warnings(log, found.columns, followers, {"lead": 2.0})
 
-    assert warnings() == []
-    assert warnings(("lead", "mirror"), mirror=columns["mirror"] + 0.04) == []
-    (one,) = warnings(mirror=-columns["mirror"], same=lead + 0.15)
-    assert "column 'mirror' differs by up to 0.3 [rad or m] from -0.5 x 'lead' +0.2" in one
-    assert "so do: same" in one
+@pytest.mark.parametrize(
+    ("names", "readings", "servos", "units", "scale", "told"),
+    [
+        # Radians with names of LeRobot's servos, or without; a robot that moves little.
+        (POS, SWING, LEROBOT, None, 1.0, "in rad: as degrees or -100 ... 100 the robot would har"),
+        (POS, SWING, None, None, 1.0, "assumed to be in rad"),
+        (JOINTS, SWING, LEROBOT, None, 1.0, None),
+        (JOINTS, HOLES, None, None, 1.0, None),
+        (JOINTS, HELD, None, None, 0.2, "in rad: but as degrees they would be within"),
+        (JOINTS, HELD, None, "rad", 0.2, None),
+        (POS, HELD, LEROBOT, None, None, r"normalised .*could be radians or degrees.*--units rad"),
+        (POS, SWING, SO, None, None, r"normalised .*could be radians or degrees.*--units rad"),
+        (JOINTS, SWING + 1.7, None, None, None, r"'j1' is 0.9\d+ to 3.3.*and not clearly degrees"),
+        # Degrees: by limits beyond 100; up to 100 they could be normalised.
+        (POS, 1.1 * DEG * SWING, LEROBOT, None, 1.1, "LeRobot's degrees: only as degrees"),
+        (POS, DEG * SWING, LEROBOT, None, None, r"normalised .*could be degrees.*--units rad"),
+        (JOINTS, DEG * SWING, None, None, 1.0, "in deg: only as degrees"),
+        (JOINTS, DEG * SWING, None, "deg", 1.0, None),
+        (JOINTS, 99.5 / 1.6 * SWING, None, None, None, r"normalised.*from: \[-100, 100\]"),
+        # Normalised: a robot that moves little about the middle, in steps of its encoders.
+        (POS, np.round(13.0 * SWING) / 13.0, LEROBOT, None, None, "their ranges are not known"),
+        # Steps.
+        (JOINTS, 2048 + SWING / STEP, LEROBOT, None, 1.0, "encoder steps, 4096"),
+        (JOINTS, 2048 + SWING / STEP, None, None, None, "or steps"),
+        # One column alone is in degrees.
+        (POS, SWING * [1.2 * DEG, 1, 1], LEROBOT, None, None, "j1.pos are in degrees, but j2.pos"),
+    ],
+)
+def test_limits_and_what_moves_tell_the_unit(names, readings, servos, units, scale, told):
+    if scale is None:
+        with pytest.raises(SceneError, match=told):
+            map_log(names, readings, WIDE, servos, units=units)
+        return
+    found = map_log(names, readings, WIDE, servos, units=units)
+    expected = np.where(np.isnan(readings), np.nan, scale * SWING)
+    np.testing.assert_allclose(found.positions, expected, atol=1e-9)
+    assert told in found.warnings[0] if told else found.warnings == ()
+
+
+OPEN = np.linspace(0.0, 1.0, 40)
+
+
+def test_grippers_and_lengths_beside_radians():
+    for joint, upper, readings, servos, expected, told in (
+        ("gripper", 1.7, 1.6 * OPEN, LEROBOT, 1.6 * OPEN, None),
+        # A column that is called otherwise may be an opening.
+        ("claw j4", 1.7, 0.7 * OPEN, LEROBOT, None, "'j4' of the joint log, 0 to 0.7, is not"),
+        ("claw j4", 1.7, OPEN - 0.1, LEROBOT, OPEN - 0.1, ""),
+        ("slide_claw j4", 0.04, 0.03 * OPEN, LEROBOT, 0.03 * OPEN, ""),
+        ("gripper", 1.7, 100 * OPEN, LEROBOT, 1.7 * OPEN, "LeRobot's opening, 0 to 100"),
+        ("gripper", 1.7, 100 * OPEN, None, None, "it seems to be a gripper's opening"),
+        ("gripper", 0.5, OPEN, None, None, "it seems to be a gripper's opening"),
+        ("slide_finger", 0.04, 0.04 * OPEN, None, 0.04 * OPEN, None),
+        ("slide_finger", 0.04, 40 * OPEN, None, 0.04 * OPEN, "assumed to be in mm"),
+        ("slide_finger", 0.04, 40 * OPEN, LEROBOT, 0.016 * OPEN, "LeRobot's opening, 0 to 100"),
+        # What lies between motor and finger is not known.
+        ("gripper", 1.7, 2048 + 900 * OPEN, LEROBOT, None, "does not tell its position"),
+        ("slide_rail", 0.9, 800 * OPEN, None, 0.8 * OPEN, "assumed to be in mm"),
+        ("slide_rail", 0.9, OPEN + 0.1, None, OPEN + 0.1, "gives 1.1 m in row 39, outside"),
+    ):
+        joint, column = joint.split()[0], joint.split()[-1]
+        model = {"names": (*JOINTS, joint), "lower": np.append(WIDE["lower"], 0.0)}
+        model["upper"] = np.append(WIDE["upper"], upper)
+        arm = SWING if readings.max() < 2048 else 2048 + SWING / STEP
+        found = map_log((*JOINTS, column), np.column_stack([arm, readings]), model, servos)
+        np.testing.assert_allclose(found.positions[:, :3], SWING, atol=1e-9)
+        if expected is None:
+            assert found.not_logged == (joint,)
+        else:
+            np.testing.assert_allclose(found.positions[:, 3], expected, atol=1e-12)
+        assert told is None or told in " ".join(found.warnings)
+        assert told is not None or found.warnings == ()
+
+
+def test_columns_of_followers_have_their_words():
+    model = {"names": ("slide_left", "slide_right_joint")}
+    model |= {"lower": np.zeros(2), "upper": np.full(2, 0.04)}
+    for names, joints in (
+        (("slide_right_joint",), ("slide_right_joint",)),
+        (("slide_right.pos", "slide_left"), ("slide_right_joint", "slide_left")),
+        (("left", "right"), ("slide_left",)),
+    ):
+        readings = 0.03 * OPEN[:, None] * [1.0, 0.5][: len(names)]
+        found = map_log(names, readings, model, followers=("slide_right_joint",))
+        assert sorted(found.columns) == sorted(joints)
 
 
 def joints_of(urdf):
     """Return the movable joints of a URDF that are not mimic joints, and their limits."""
     moving = [one for one in ElementTree.parse(urdf).iter("joint") if one.get("type") != "fixed"]
     moving = [one for one in moving if one.find("mimic") is None]
-    sides = {
-        side: [float(one.find("limit").get(side)) for one in moving] for side in ("lower", "upper")
-    }
-    arrays = {side: np.array(values) for side, values in sides.items()}
-    return {"names": tuple(one.get("name") for one in moving), **arrays}
+    model = {"names": tuple(one.get("name") for one in moving)}
+    for side in ("lower", "upper"):
+        model[side] = np.array([float(one.find("limit").get(side)) for one in moving])
+    return model
 
 
 def test_real_logs_are_mapped(shared_data):
@@ -232,11 +241,11 @@ def test_real_logs_are_mapped(shared_data):
     model = joints_of(folder / "robot" / "g1_upper_body_from_torso.urdf")
     found = map_log(log.names, log.positions, model)
     arms = [k for k, name in enumerate(model["names"]) if name not in found.not_logged]
-    np.testing.assert_array_equal(found.log.positions[:, arms], log.positions[:, :14])
+    np.testing.assert_array_equal(found.positions[:, arms], log.positions[:, :14])
     assert found.warnings[-1].endswith(f"are not joints: {', '.join(log.names[14:])}")
     robot = joints_of(shared_data / "droid_episodes" / "robot" / "panda_robotiq.urdf")
     log = open_episode(shared_data / "droid_episodes" / "cloth").joints
     table = {"finger_joint": Column("gripper_position", 0.8)}
     found = map_log(log.names, log.positions, robot, table=table)
     assert found.not_logged == ()
-    np.testing.assert_allclose(found.log.positions[:, -1], 0.8 * log.positions[:, -1])
+    np.testing.assert_allclose(found.positions[:, -1], 0.8 * log.positions[:, -1])

@@ -19,12 +19,7 @@ from drake_pose.camera.models import (
 )
 from drake_pose.errors import CameraError
 
-
-def pose(rpy, p):
-    return RigidTransform(RollPitchYaw(*rpy), np.array(p)).GetAsMatrix4()
-
-
-X_WC = pose((0.3, -0.8, 1.1), (0.5, -2.0, 1.5))
+X_WC = RigidTransform(RollPitchYaw(0.3, -0.8, 1.1), np.array([0.5, -2.0, 1.5])).GetAsMatrix4()
 PINHOLE = PinholeCamera("cam", 640, 480, 600.0, 610.0, 300.0, 250.0, X_WC)
 PARALLEL = ParallelCamera("flat", 700, 500, 226.0, 350.0, 200.0, X_WC)
 POINTS = np.array([[0.1, -0.2, 1.3], [-0.4, 0.3, 2.0]])
@@ -46,19 +41,16 @@ def test_pinhole_projection_matches_opencv():
     np.testing.assert_allclose(depth, p_C[:, 2], atol=1e-12)
 
 
-def test_resized_cameras_keep_the_image_corners():
-    """Image corners, half a pixel outside the outermost centres, stay corners."""
+def test_resized_and_mirrored_cameras():
+    """Image corners, half a pixel outside the outermost centres, stay corners.
+
+    A scene is mirrored in the plane x = 0 of the camera; mirroring twice is the identity.
+    """
     camera = replace(PINHOLE, X_WC=np.eye(4))
     before, after = camera.project(POINTS)[0], camera.resized(160, 240).project(POINTS)[0]
     np.testing.assert_allclose((after + 0.5) * [4.0, 2.0], before + 0.5)
-
-
-def test_a_mirrored_camera_sees_the_mirrored_scene():
-    """For a scene mirrored in the plane x = 0 of the camera; mirroring twice is the identity."""
-    camera = replace(PINHOLE, X_WC=np.eye(4))
     seen = camera.mirrored().project(POINTS * [-1, 1, 1])[0]
-    expected = [camera.width - 1, 0] + camera.project(POINTS)[0] * [-1, 1]
-    np.testing.assert_allclose(seen, expected)
+    np.testing.assert_allclose(seen, [camera.width - 1, 0] + before * [-1, 1])
     again = camera.mirrored().mirrored()
     np.testing.assert_array_equal(again.kernel_parameters(), camera.kernel_parameters())
 
@@ -74,25 +66,21 @@ def test_depth_is_along_the_optical_axis():
     np.testing.assert_array_equal(depth, points[:, 2])
 
 
-@pytest.mark.parametrize(
-    ("camera", "expected"),
-    [
+def test_poses_and_kernel_parameters():
+    for camera, expected in (
         (replace(PINHOLE, near=0.2), [0, 600, 610, 300, 250, 0.2, 640, 480]),
         (PARALLEL, [1, 226, 226, 350, 200, 0, 700, 500]),
-    ],
-)
-def test_poses_and_kernel_parameters(camera, expected):
-    np.testing.assert_array_equal(camera.kernel_parameters(), expected)
-    np.testing.assert_allclose(camera.X_CW @ camera.X_WC, np.eye(4), atol=1e-14)
-    assert not camera.X_WC.flags.writeable
-    moved = camera.with_pose(np.eye(4))
-    assert np.array_equal(moved.X_WC, np.eye(4))
-    np.testing.assert_array_equal(moved.kernel_parameters(), camera.kernel_parameters())
+    ):
+        np.testing.assert_array_equal(camera.kernel_parameters(), expected)
+        np.testing.assert_allclose(camera.X_CW @ camera.X_WC, np.eye(4), atol=1e-14)
+        assert not camera.X_WC.flags.writeable
+        moved = camera.with_pose(np.eye(4))
+        assert np.array_equal(moved.X_WC, np.eye(4))
+        np.testing.assert_array_equal(moved.kernel_parameters(), camera.kernel_parameters())
 
 
-@pytest.mark.parametrize(
-    ("field", "values"),
-    [
+def test_invalid_parameters_are_named():
+    for field, values in (
         ("width", [0, 12.5]),
         ("height", [-3, 10**9]),
         ("focal_x", [0.0, float("nan")]),
@@ -102,14 +90,12 @@ def test_poses_and_kernel_parameters(camera, expected):
         ("near", [0.0, True]),
         ("X_WC", [np.eye(3), np.full((4, 4), np.nan), np.array([["a"] * 4] * 4)]),
         ("X_WC", [np.diag([1.0, 1.0, *two]) for two in [(2.0, 1.0), (-1.0, 1.0), (1.0, 2.0)]]),
-    ],
-)
-def test_invalid_parameters_are_named(field, values):
-    for value in values:
-        with pytest.raises(CameraError, match=f"'cam'.*{field}"):
-            replace(PINHOLE, **{field: value})
-    with pytest.raises(CameraError, match=r"'flat'.*pixels_per_metre"):
-        replace(PARALLEL, pixels_per_metre=-1.0)
+    ):
+        for value in values:
+            with pytest.raises(CameraError, match=f"'cam'.*{field}"):
+                replace(PINHOLE, **{field: value})
+        with pytest.raises(CameraError, match=r"'flat'.*pixels_per_metre"):
+            replace(PARALLEL, pixels_per_metre=-1.0)
 
 
 def test_rounded_rotation_becomes_exact():
@@ -132,9 +118,7 @@ def test_conversion_to_drake_and_back():
     assert (plain.center_x, plain.center_y) == (49.0, 39.0)
     with pytest.raises(CameraError, match=r"'cam'.*depth range"):
         camera_to_drake(PINHOLE, renderer_name="vtk", depth_range=(2.0, 1.0))
-
-
-def test_sensor_offset_of_a_render_camera_is_applied():
+    # The sensor's offset in its body.
     X_BS = RigidTransform(RollPitchYaw(0.1, 0.2, 0.3), np.array([0.1, 0.0, -0.2]))
     core = RenderCameraCore("vtk", CameraInfo(100, 80, 1.0), ClippingRange(0.3, 9.0), X_BS)
     X_WB = RigidTransform(X_WC)
@@ -180,11 +164,12 @@ def test_cameras_on_a_circle_look_at_its_centre_and_the_face():
 
 
 def test_principal_points_far_from_the_middle_are_warned_of():
+    """Those of pictures of twice the size, exchanged, and of 1920 x 1080 pixels."""
+
     def said(center_x, center_y, width=640, height=480):
         camera = PinholeCamera("eye", width, height, 600.0, 600.0, center_x, center_y, np.eye(4))
         return "".join(intrinsics_warnings([camera]))
 
-    # Of pictures of twice the size, exchanged, and of 1920 x 1080 pixels.
     for x, y in ((639.5, 479.5), (238.0, 322.0), (959.5, 539.5)):
         assert f"pictures of {2 * x + 1:.0f} x {2 * y + 1:.0f}" in said(x, y)
     # Lenses are within a tenth of the pictures' size of the middle, in square pictures, too.

@@ -1,14 +1,26 @@
 """Files with poses of cameras alone, in the formats of the tools that write them."""
 
+import io
 import json
 
+import cv2
 import numpy as np
 import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
-from drake_pose.camera.camera_files import intrinsics_of, load_camera_file, load_cameras
-from drake_pose.camera.exchange import ros_camera_info, ros_transforms
+from drake_pose.camera.camera_files import (
+    CameraFile,
+    intrinsics_of,
+    load_camera_file,
+    load_cameras,
+)
+from drake_pose.camera.exchange import (
+    dump_scenario,
+    mujoco_cameras,
+    ros_camera_info,
+    ros_transforms,
+)
 from drake_pose.camera.models import PinholeCamera, inverse_pose
 from drake_pose.camera.pose_files import END_EFFECTOR
 from drake_pose.errors import CameraError
@@ -27,16 +39,32 @@ SIX = [*X[:3, 3].tolist(), *Rotation.from_matrix(X[:3, :3]).as_euler("xyz").toli
 X_LINK = X.copy()
 X_LINK[:3, :3] = X[:3, :3] @ np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 LINK_Q = Rotation.from_matrix(X_LINK[:3, :3]).as_quat().tolist()
-FRAMES = {"robot_base_frame": "base_link", "robot_effector_frame": "tool0"}
-EASY = {"eye_on_hand": False, "tracking_base_frame": "camera_color_optical_frame", **FRAMES}
+EASY = {
+    "eye_on_hand": False, "tracking_base_frame": "camera_color_optical_frame",
+    "robot_base_frame": "base_link", "robot_effector_frame": "tool0",
+}  # fmt: skip
 MOVED = {"translation": PLACE, "rotation": TURN}
 SAME = {"translation": dict.fromkeys("xyz", 0.0), "rotation": dict.fromkeys("xyz", 0.0) | {"w": 1}}
-LAUNCH = """<launch>
-  <!-- xyz="0 0 0" rpy="0 0 0" -->
-  <node pkg="tf2_ros" type="static_transform_publisher" name="camera_link_broadcaster"
-      args="{}   {} {} {}" />
-</launch>
+LAUNCH = """<launch><!-- xyz="0 0 0" -->
+  <node pkg="tf2_ros" type="static_transform_publisher" name="broadcaster" args="{}  {} {} {}" />
+</launch>"""
+LAUNCH_PY = f"""LaunchDescription([Node(package='tf2_ros', executable='static_transform_publisher',
+    arguments=[{", ".join(f"'{x!r}'" for x in SIX[:3])}, {str(QUATERNION)[1:-1]}, 'base', "cam"])])
 """
+ECHO = f"""[INFO] [17.2]: Waiting for transform base ->  cam: Invalid frame ID
+At time 17.5
+- Translation: {np.round(SIX[:3], 4).tolist()}
+- Rotation: in Quaternion (xyzw) {np.round(QUATERNION, 4).tolist()}
+- Rotation: in RPY (radian) {np.round(SIX[3:], 3).tolist()}
+"""
+PLAIN = {"rotation_matrix": X[:3, :3].tolist(), "translation_vector": SIX[:3]}
+POST = np.eye(4)
+POST[:3, 3] = [0.2, 0.0, 0.5]
+ON_POST = inverse_pose(POST) @ X
+VIEWER = (
+    f'pos="{" ".join(map(str, SIX[:3]))}" '
+    f'xyaxes="{" ".join(map(str, (X * [1, -1, -1, 1])[:3, :2].T.ravel()))}"'
+)
 
 
 def easy(rotation=QUATERNION, **parameters):
@@ -61,79 +89,113 @@ def scene(tmp_path):
     return file
 
 
+def saved(save, *arrays, **named):
+    """Return the bytes of arrays as NumPy writes them."""
+    file = io.BytesIO()
+    save(file, *arrays, **named)
+    return file.getvalue()
+
+
+def urdf(*joints):
+    """Return a URDF of joints (parent, child, pose and, unless it is fixed, type)."""
+    text = ""
+    for parent, child, pose, *kind in joints:
+        xyz, rpy = pose[:3, 3], Rotation.from_matrix(pose[:3, :3]).as_euler("xyz")
+        origin = " ".join(f'{k}="{x} {y} {z}"' for k, (x, y, z) in {"xyz": xyz, "rpy": rpy}.items())
+        ends = f'<parent link="{parent}"/><child link="{child}"/><origin {origin}/>'
+        text += f'<joint name="{child}_joint" type="{(kind or ["fixed"])[0]}">{ends}</joint>'
+    return f'<?xml version="1.0"?>\n<robot name="arm">{text}</robot>'
+
+
+def mjcf(camera, body="<body><geom/>{}</body>"):
+    return f"<mujoco><worldbody>{body.format(f'<camera {camera}/>')}</worldbody></mujoco>"
+
+
 def load(path, content, intrinsics, recording=None):
-    path.write_text(content if isinstance(content, str) else yaml.safe_dump(content))
+    if not isinstance(content, str | bytes):
+        content = (json.dumps if path.suffix == ".json" else yaml.safe_dump)(content)
+    path.write_bytes(content.encode() if isinstance(content, str) else content)
     known = intrinsics_of(path.with_name("cameras.yaml"), intrinsics)
     return load_camera_file(path, known=known, recording=recording)
 
 
-@pytest.mark.parametrize(
-    ("name", "content"),
-    [
-        ("easy.yaml", easy()),
-        ("easy.yaml", EASY | {"transformation": PLACE | Q}),
-        (
-            "easy.calib",
-            {"parameters": EASY | {"calibration_type": "eye_on_base"}, "transform": MOVED},
-        ),
-        ("easy.yaml", easy(LINK_Q, tracking_base_frame="camera_link")),
-        ("pose.launch", launch(QUATERNION, "cam_optical")),
-        ("pose.launch", launch(LINK_Q, "camera_link")),
-        ("pose.launch", launch(SIX[:2:-1], "cam_optical", "100")),
-        (
-            "pose.launch.py",
-            "Node(package='tf2_ros', executable='static_transform_publisher', arguments=["
-            + ", ".join(f"'{x!r}'" for x in [*X[:3, 3].tolist(), *QUATERNION])
-            + ", 'base', 'cam_optical'])",
-        ),
-        ("pose.launch.xml", ros_transforms([CAMERA], {"left": "base"})),
-        (
-            "tf.yaml",
-            {
-                "transforms": [
-                    transform("base", "mount", MOVED),
-                    transform("mount", "camera_optical_frame", SAME),
-                ]
-            },
-        ),
-        ("six.json", {"left": SIX}),
-        ("six.json", {"left": [*SIX[:3], *np.degrees(SIX[3:]).tolist()]}),
-        ("seven.yaml", {"left": [*SIX[:3], *QUATERNION]}),
-        ("matrix.yaml", {"left": X.tolist()}),
-        ("matrix.yaml", {"left": {"X_WC": X.tolist()}}),
-        ("matrix.yaml", {"left": {"T_base_cam": X[:3].tolist()}}),
-        ("matrix.yaml", {"left": {"T_cam2base": X.ravel().tolist()}}),
-        ("matrix.yaml", {"left": {"T_cam_base": inverse_pose(X).tolist()}}),
-        ("matrix.yaml", {"left": {"world_to_camera": inverse_pose(X).tolist()}}),
-        ("matrix.yaml", {"T_base_camera": X.round(3).tolist()}),
-        (
-            "parts.yaml",
-            {"left": {"position": SIX[:3], "quat_wxyz": [QUATERNION[3], *QUATERNION[:3]]}},
-        ),
-        ("parts.yaml", {"left": {"translation": SIX[:3], "rotation": X[:3, :3].tolist()}}),
-        ("parts.yaml", {"left": {"tvec": SIX[:3], "rvec": RVEC}}),
-        ("parts.yaml", {"left": PLACE | dict(zip(("roll", "pitch", "yaw"), SIX[3:], strict=True))}),
-        ("parts.yaml", {"left": {"xyz": SIX[:3], "rpy_deg": np.degrees(SIX[3:]).tolist()}}),
-        ("parts.yaml", {"left": {"xyz": SIX[:3], "rpy": SIX[3:]}}),
-    ],
-)
-def test_poses_without_intrinsics_are_read(tmp_path, scene, name, content):
+FORMS = {
+    "six": SIX,
+    "six, deg": [*SIX[:3], *np.degrees(SIX[3:]).tolist()],
+    "seven": [*SIX[:3], *QUATERNION],
+    "matrix": X.tolist(),
+    "X_WC": {"X_WC": X.tolist()},
+    "3 x 4": {"T_base_cam": X[:3].tolist()},
+    "flat": {"T_cam2base": X.ravel().tolist()},
+    "inverse": {"T_cam_base": inverse_pose(X).tolist()},
+    "view": {"world_to_camera": inverse_pose(X).tolist()},
+    "wxyz": {"position": SIX[:3], "quat_wxyz": [QUATERNION[3], *QUATERNION[:3]]},
+    "R, t": {"translation": SIX[:3], "rotation": X[:3, :3].tolist()},
+    "rvec": {"tvec": SIX[:3], "rvec": RVEC},
+    "angles": PLACE | dict(zip(("roll", "pitch", "yaw"), SIX[3:], strict=True)),
+    "rpy_deg": {"xyz": SIX[:3], "rpy_deg": np.degrees(SIX[3:]).tolist()},
+    "rpy": {"xyz": SIX[:3], "rpy": SIX[3:]},
+}
+FRAMES = [transform("base", "mount", MOVED), transform("mount", "camera_optical_frame", SAME)]
+REALSENSE = urdf(
+    ("base", "camera_link", X_LINK), ("camera_link", "camera_depth_optical_frame", POST),
+    ("camera_link", "camera_color_optical_frame", inverse_pose(X_LINK) @ X),
+)  # fmt: skip
+FILES = [
+    *((f"{name}.json", {"left": form}) for name, form in FORMS.items()),
+    ("easy.yaml", easy()),
+    ("easy.yaml", EASY | {"transformation": PLACE | Q}),
+    ("easy.calib", {"parameters": EASY | {"calibration_type": "eye_on_base"}, "transform": MOVED}),
+    ("easy.yaml", easy(LINK_Q, tracking_base_frame="camera_link")),
+    ("pose.launch", launch(QUATERNION, "cam_optical")),
+    ("pose.launch", launch(LINK_Q, "camera_link")),
+    ("pose.launch", launch(SIX[:2:-1], "cam_optical", "100")),
+    ("pose.launch.py", LAUNCH_PY),
+    ("pose.launch.xml", ros_transforms([CAMERA], {"left": "base"})),
+    ("tf.yaml", {"transforms": FRAMES}),
+    ("rounded.yaml", {"T_base_camera": X.round(3).tolist()}),
+    ("rounded.txt", 2 * ECHO),
+    ("one.npy", saved(np.save, X)),
+    ("frames.npy", saved(np.save, np.repeat(X[None], 9, 0))),
+    ("named.npz", saved(np.savez, left=X)),
+    ("first.npz", saved(np.savez, X[:3])),
+    ("cv2.npz", saved(np.savez, R_cam2base=X[:3, :3], t_cam2base=X[:3, 3:])),
+    ("front.txt", saved(np.savetxt, X)),
+    ("front.csv", saved(np.savetxt, X[:3], delimiter=",", header="X_WC of left")),
+    ("agibot.json", 3 * [{"extrinsic": PLAIN}]),
+    ("list.json", [{"camera": "left", **PLAIN}]),
+    ("list.json", [X.tolist()]),
+    ("list.json", [{"cam_id": "a", "pose": POST.tolist()}, {"cam_id": "left", "pose": SIX}]),
+    ("post.urdf", urdf(("base", "post", POST), ("post", "cam_optical", ON_POST))),
+    ("link.urdf", urdf(("base", "post", POST), ("post", "camera", inverse_pose(POST) @ X_LINK))),
+    ("realsense.urdf", REALSENSE),
+    ("mujoco.xml", mujoco_cameras([CAMERA])),
+    ("viewer.xml", mjcf(VIEWER)),
+]
+WRIST = mjcf('name="left"', '<body name="tool0"><joint/><body>{}</body></body>')
+CV2 = saved(np.savez, R_cam2gripper=X[:3, :3], t_cam2gripper=X[:3, 3])
+ON_LINKS = [
+    ("easy.yaml", easy(eye_on_hand=True), "tool0"),
+    ("easy.yaml", easy(eye_on_hand=True, robot_effector_frame=""), END_EFFECTOR),
+    ("pose.launch", launch(QUATERNION, "cam_optical", parent="tool0"), "tool0"),
+    ("cv2.npz", CV2, END_EFFECTOR),
+    ("mujoco.xml", mujoco_cameras([CAMERA], {"left": "tool0"}), "tool0"),
+    ("arm.xml", WRIST, "tool0"),
+    ("drake.yaml", dump_scenario([CAMERA], {"left": "tool0"}), "tool0"),
+    ("a.urdf", urdf(("base", "tool0", X, "revolute"), ("tool0", "cam_optical", X)), "tool0"),
+]
+
+
+@pytest.mark.parametrize(("name", "content", "link"), [*((*file, "") for file in FILES), *ON_LINKS])
+def test_poses_are_read(tmp_path, scene, name, content, link):
+    """In the world, or on a link."""
     found = load(tmp_path / name, content, scene)
-    rounded = 1e-3 if name == "matrix.yaml" and "T_base_camera" in content else 1e-9
     (camera,) = found.cameras.values()
-    np.testing.assert_allclose(camera.X_WC, X, atol=rounded)
+    atol = 1e-3 if name.startswith("rounded") else 1e-9
+    X_C = np.diag([1, -1, -1, 1]) if content is WRIST else X
+    np.testing.assert_allclose(camera.X_WC, X_C, atol=atol)
     assert (camera.name, camera.focal_x, camera.width) == ("left", 640.0, 1280)
-    assert not found.links
-    assert not found.unplaced
-
-
-def test_a_camera_on_the_hand_has_its_link(tmp_path, scene):
-    for name, content, link in (
-        ("easy.yaml", easy(eye_on_hand=True), "tool0"),
-        ("easy.yaml", easy(eye_on_hand=True, robot_effector_frame=""), END_EFFECTOR),
-        ("pose.launch", launch(QUATERNION, "cam_optical", parent="tool0"), "tool0"),
-    ):
-        assert load(tmp_path / name, content, scene).links == {"left": link}
+    assert (found.links, found.unplaced) == ({"left": link} if link else {}, ())
 
 
 def test_files_of_many_episodes_give_the_recordings_own(tmp_path):
@@ -143,15 +205,11 @@ def test_files_of_many_episodes_give_the_recordings_own(tmp_path):
     recording.mkdir()
     roles = {"uuid": own, "ext1_cam_serial": serial, "ext2_cam_serial": "24400334"}
     (recording / f"metadata_{own}.json").write_text(json.dumps(roles))
-    other = [*np.add(SIX[:3], 1.0).tolist(), *SIX[3:]]
-    poses = {
-        "RAIL+1+2023": {serial: other, f"{serial}_quality_metric": 0.9},
-        own: {serial: SIX, f"{serial}_metric_type": "iou", "relative_path": "AUTOLab/success"},
-    }
-    lenses = {
-        "RAIL+1+2023": {serial: [1.0, 2.0, 3.0, 4.0]},
-        own: {serial: [530.0, 640.0, 531.0, 360.0]},
-    }
+    other = {serial: [*np.add(SIX[:3], 1.0).tolist(), *SIX[3:]], f"{serial}_quality_metric": 0.9}
+    right = {serial: SIX, f"{serial}_metric_type": "iou", "relative_path": "AUTOLab/success"}
+    poses = {"RAIL+1+2023": other, own: right}
+    lenses = {"RAIL+1+2023": {serial: [1.0, 2.0, 3.0, 4.0]}}
+    lenses |= {own: {serial: [530.0, 640.0, 531.0, 360.0]}}
     (tmp_path / "intrinsics.json").write_text(json.dumps(lenses))
     (tmp_path / "cam2base_extrinsics.json").write_text(json.dumps(poses))
     known = intrinsics_of(recording / "cameras.yaml", tmp_path / "intrinsics.json")
@@ -165,10 +223,8 @@ def test_files_of_many_episodes_give_the_recordings_own(tmp_path):
     lines = [{"episode_uuid": "RAIL+1+2023", **view}, {"episode_uuid": own, **view}]
     left = {"fx": 530.0, "fy": 531.0, "cx": 640.0, "cy": 360.0, "width": 1280, "height": 720}
     cameras = {"ext1": {"serial": serial, "left": left, "stereo_baseline_m": 0.12}}
-    calibrated = [
-        {"episode_uuid": "RAIL+1+2023", "cameras": {}},
-        {"episode_uuid": own, "cameras": cameras},
-    ]
+    calibrated = [{"episode_uuid": "RAIL+1+2023", "cameras": {}}]
+    calibrated += [{"episode_uuid": own, "cameras": cameras}]
     for name, records in (("extrinsics", lines), ("camera_intrinsics", calibrated)):
         (tmp_path / f"{name}.jsonl").write_text("\n".join(map(json.dumps, records)) + "\n")
     known = intrinsics_of(recording / "cameras.yaml", tmp_path / "camera_intrinsics.jsonl")
@@ -177,22 +233,46 @@ def test_files_of_many_episodes_give_the_recordings_own(tmp_path):
     assert again[serial].focal_y == 531.0
 
 
-@pytest.mark.parametrize(
-    ("content", "words"),
-    [
+def test_what_is_wanted_is_said(tmp_path):
+    for content, words in (
         ({"left": SIX}, ["has poses (left)", "--intrinsics FILE"]),
         (easy(), ["camera_color_optical_frame"]),
         ({"left": [*SIX[:3], 0.5, 0.5, 0.5, 0.9]}, ["camera 'left'", "length 1.25"]),
-        ({"left": {"X_WC": (2.0 * X).tolist()}}, ["a pinhole camera needs width"]),
+        ({"left": {"X_WC": (2.0 * X).tolist()}}, ["camera 'left': the last row of the pose"]),
+        ([{"extrinsic": PLAIN}, {"pose": X_LINK.tolist()}], ["2 poses without the names"]),
         ({"left": {"t": SIX[:3], "R": (1.2 * X[:3, :3]).tolist()}}, ["not a rotation"]),
-        ({"left": {"speed": 3}}, ["easy_handeye", "cam2base_extrinsics.json", "NAME: POSE"]),
-    ],
-)
-def test_what_is_wanted_is_said(tmp_path, content, words):
-    with pytest.raises(CameraError) as caught:
-        load(tmp_path / "cameras.json", content, None)
-    for word in words:
-        assert word in str(caught.value)
+        ({"rvecs": [[0.1, 0.2, 0.3], [1.0, 1.1, 1.2]]}, ["it has rvecs. Tried"]),
+        ({"left": {"speed": 3}}, ["it has left. Tried", "easy_handeye", "NAME: POSE"]),
+    ):
+        with pytest.raises(CameraError) as caught:
+            load(tmp_path / "cameras.json", content, None)
+        for word in words:
+            assert word in str(caught.value)
+
+
+@pytest.mark.parametrize("kind", ["npz", "opencv.json", "urdf"])
+def test_the_recording_says_size_and_name_of_its_camera(tmp_path, kind):
+    (tmp_path / "masks" / "front").mkdir(parents=True)
+    cv2.imwrite(str(tmp_path / "masks" / "front" / "0.png"), np.zeros((720, 1280), np.uint8))
+    K, path = [[640.0, 0.0, 639.5], [0.0, 642.0, 359.5], [0.0, 0.0, 1.0]], tmp_path / f"a.{kind}"
+    if kind == "npz":
+        np.savez(path, camera_matrix=K, dist_coeffs=np.zeros(5), T_base_cam=X)
+    elif kind == "opencv.json":
+        inverse = inverse_pose(X)
+        turned = {"R": inverse[:3, :3].tolist(), "T": inverse[:3, 3].tolist()}
+        path.write_text(json.dumps({"camera_matrix": K, **turned}))
+    else:
+        ends = f'<origin xyz="{SIX[:3]}" rpy="{SIX[3:]}"/>'.translate(
+            dict.fromkeys(map(ord, "[],"))
+        )
+        path.write_text(
+            '<robot name="arm"><link name="base"/><link name="front"/><joint name="j" type="fixed">'
+            f'<parent link="base"/><child link="front"/>{ends}</joint></robot>'
+        )
+    found = load_cameras(path, lambda: CameraFile({"front": CAMERA}, ()), tmp_path)
+    np.testing.assert_allclose(found["front"].X_WC, X, atol=1e-9)
+    front = found["front"]
+    assert (front.name, front.width, front.focal_y) == ("front", 1280, 642)
 
 
 def test_a_pose_of_no_camera_is_refused(tmp_path):
@@ -209,6 +289,7 @@ def test_what_was_assumed_is_said(tmp_path, scene):
         ({"left": SIX}, "roll, pitch, yaw [rad]"),
         ({"left": [*SIX[:3], *QUATERNION]}, "read as x, y, z, w"),
         ({"left": X.tolist()}, ""),
+        (ECHO, "as tf2_echo BASE CAMERA prints"),
     ):
         found = load(tmp_path / "poses.yaml", content, scene)
         assert bool(found.warnings) == bool(text)

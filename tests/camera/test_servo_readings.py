@@ -7,16 +7,9 @@ import pytest
 
 from drake_pose.camera.episode import JointLog
 from drake_pose.camera.joint_map import map_joints, motors_of, read_joint_map
-from drake_pose.camera.servo_readings import (
-    Column,
-    ServoJoint,
-    Servos,
-    correct_homing,
-    dump_column,
-    find_motors,
-    read_motors,
-)
+from drake_pose.camera.servo_readings import Column, JointReadings, Servos, find_motors, read_motors
 from drake_pose.errors import SceneError
+from drake_pose.jobs.registration.lerobot_files import correct_homing, dump_column
 
 BODY = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll")
 NAMES = (*BODY, "gripper")
@@ -29,9 +22,7 @@ STEP = 2.0 * np.pi / 4096
 class Encoder:
     """A motor whose encoder is mounted at any angle, calibrated as LeRobot does, in whole steps."""
 
-    def __init__(
-        self, rng, lower, upper, *, full=False, dynamixel=False, inverted=False, wrong=0.0
-    ):
+    def __init__(self, rng, lower, upper, full=False, dynamixel=False, inverted=False, wrong=0.0):
         """wrong: middle of the range as calibrated, less the true one [rad]."""
         self.dynamixel, self.inverted = dynamixel, inverted
         # Dynamixel's motors invert what they count, so that a joint counts up with its angle.
@@ -76,10 +67,8 @@ def arm_of(seed, wrong=(0.0,) * 6, **more):
         name: Encoder(rng, low, high, full=name == "wrist_roll", wrong=off, **more)
         for name, low, high, off in zip(NAMES, LOWER, UPPER, wrong, strict=True)
     }
-    spread = 0.7 * np.sin(
-        np.linspace(0, 3, 40)[:, None] * rng.uniform(1, 2, 6) + rng.uniform(0, 6, 6)
-    )
-    return arm, 0.5 * (LOWER + UPPER) + spread * 0.5 * (UPPER - LOWER)
+    phases = np.linspace(0, 3, 40)[:, None] * rng.uniform(1, 2, 6) + rng.uniform(0, 6, 6)
+    return arm, 0.5 * (LOWER + UPPER) + 0.7 * np.sin(phases) * 0.5 * (UPPER - LOWER)
 
 
 def log_of(arm, angles, mode, suffix=".pos", servos=None):
@@ -100,24 +89,28 @@ def write_file(path, arm):
     return path
 
 
-@pytest.mark.parametrize("robot", ["so101_follower", "koch_follower", "my_arm"])
-@pytest.mark.parametrize("mode", ["normalised", "deg", "steps"])
-def test_a_calibration_file_gives_the_models_angles(tmp_path, robot, mode):
-    arm, angles = arm_of(3, dynamixel=robot.startswith("koch"))
-    servos = read_motors(write_file(tmp_path / "arm.json", arm), robot)
-    found = map_arm(log_of(arm, angles, mode, servos=servos))
-    # A step of the encoder, and one of the calibration.
-    np.testing.assert_allclose(found.log.positions, angles, atol=2.1 * STEP)
-    assert (found.encoding, found.not_logged) == (mode, ())
-    assert all(text in found.warnings[0] for text in ("arm.json", "--zeros all"))
-
-
-def test_an_inverted_motor_is_told_in_every_encoding(tmp_path):
-    arm, angles = arm_of(4, inverted=True)
-    servos = read_motors(write_file(tmp_path / "arm.json", arm), "so101_follower")
-    for mode in ("normalised", "steps"):
-        found = map_arm(log_of(arm, angles, mode, servos=servos))
-        np.testing.assert_allclose(found.log.positions, angles, atol=2.1 * STEP)
+def test_a_calibration_file_gives_the_models_angles(tmp_path):
+    """Also of columns without names: they have the file's motors in order."""
+    for robot, names, modes in (
+        ("so101_follower", None, ("normalised", "deg", "steps")),
+        ("koch_follower", None, ("normalised", "deg", "steps")),
+        ("my_arm", None, ("normalised", "deg", "steps")),
+        ("inverted so101", None, ("normalised", "steps")),
+        ("so101", tuple(f"joint_{k}" for k in range(6)), ("steps",)),
+    ):
+        is_inverted, robot = robot.startswith("inverted"), robot.split()[-1]
+        arm, angles = arm_of(3, dynamixel=robot.startswith("koch"), inverted=is_inverted)
+        write_file(tmp_path / "arm.json", arm)
+        for mode in modes:
+            log = log_of(arm, angles, mode)
+            servos, warnings = find_motors(tmp_path, robot, names or log.names)
+            assert warnings == []
+            found = map_arm(JointLog(names or log.names, log.times, log.positions, servos=servos))
+            # A step of the encoder, and one of the calibration.
+            np.testing.assert_allclose(found.positions, angles, atol=2.1 * STEP)
+            assert (found.unit, found.not_logged) == (mode, ())
+            told = found.warnings[-1]
+            assert all(text in told for text in ("arm.json", "--zeros all"))
 
 
 def test_readings_that_are_not_whole_steps_are_told_by_their_range(tmp_path):
@@ -127,7 +120,7 @@ def test_readings_that_are_not_whole_steps_are_told_by_their_range(tmp_path):
     log = log_of(arm, angles, "normalised", servos=servos)
     smooth = JointLog(log.names, log.times, log.positions + 0.004, servos=servos)
     found = map_arm(smooth)
-    np.testing.assert_allclose(found.log.positions, angles, atol=3 * STEP)
+    np.testing.assert_allclose(found.positions, angles, atol=3 * STEP)
     assert "could be degrees" in found.warnings[0]
     # Two degrees beyond the motor's range cannot be degrees.
     j = int(np.argmin(UPPER[:5] - LOWER[:5]))
@@ -136,13 +129,13 @@ def test_readings_that_are_not_whole_steps_are_told_by_their_range(tmp_path):
         readings = smooth.positions.copy()
         readings[3, j] = half + beyond
         found = map_arm(JointLog(log.names, log.times, readings, servos=servos))
-        assert found.encoding == "normalised"
+        assert found.unit == "normalised"
         assert said in found.warnings[0]
     wide = angles.copy()
     wide[3, 4] = 2.7
     log = log_of(arm, wide, "deg", servos=servos)
     smooth = JointLog(log.names, log.times, log.positions + 0.004, servos=servos)
-    assert map_arm(smooth).encoding == "deg"
+    assert map_arm(smooth).unit == "deg"
 
 
 @pytest.mark.parametrize("mode", ["normalised", "deg"])
@@ -151,8 +144,8 @@ def test_without_a_file_the_steps_in_the_readings_give_the_ranges(mode):
     arm, angles = arm_of(6)
     fine = np.repeat(angles, 4, axis=0) + np.tile([[0.0], [0.011], [0.023], [0.04]], (40, 1))
     found = map_arm(log_of(arm, fine, mode))
-    np.testing.assert_allclose(found.log.positions[:, :5], fine[:, :5], atol=3 * STEP)
-    assert found.encoding == mode
+    np.testing.assert_allclose(found.positions[:, :5], fine[:, :5], atol=3 * STEP)
+    assert found.unit == mode
 
 
 def test_a_robot_without_a_file_has_its_models_limits():
@@ -162,7 +155,7 @@ def test_a_robot_without_a_file_has_its_models_limits():
         map_arm(log)
     known = JointLog(log.names, log.times, log.positions, servos=Servos("so100_follower"))
     found = map_arm(known)
-    np.testing.assert_allclose(found.log.positions, angles[:12], atol=3 * STEP)
+    np.testing.assert_allclose(found.positions, angles[:12], atol=3 * STEP)
     text = " ".join(found.warnings)
     assert all(one in text for one in ("ranges of the motors of shoulder_pan", "--zeros all"))
 
@@ -175,7 +168,7 @@ def test_degrees_of_old_data_sets_have_another_zero():
     degrees[:, 5] = 100 * (angles[:, 5] - LOWER[5]) / (UPPER[5] - LOWER[5])
     names = tuple(f"main_{name}" for name in NAMES)
     found = map_arm(JointLog(names, np.arange(40.0), degrees, servos=Servos("so100")))
-    np.testing.assert_allclose(found.log.positions, angles, atol=1e-9)
+    np.testing.assert_allclose(found.positions, angles, atol=1e-9)
     assert "before June 2025" in " ".join(found.warnings)
 
 
@@ -196,49 +189,8 @@ def test_lists_of_older_files_home_raw_steps(tmp_path):
     servos = read_motors(path, "so100")
     names = tuple(f"main_{name}" for name in NAMES)
     found = map_arm(JointLog(names, np.arange(40.0), np.round(steps), servos=servos))
-    np.testing.assert_allclose(found.log.positions[:, :5], angles[:, :5], atol=STEP)
-    np.testing.assert_allclose(found.log.positions[:, 5], angles[:, 5], atol=0.01)
-
-
-def test_steps_without_a_file_have_their_zero_at_half_a_turn():
-    rng = np.random.default_rng(1)
-    angles = rng.uniform(-1, 1, (20, 3))
-    names, model = ("arm1_j1", "arm1_j2", "arm1_j3"), ("joint1", "joint2", "finger_joint")
-    log = JointLog(names, np.arange(20.0), 2048 + angles / STEP, servos=Servos("franka"))
-    found = map_joints(log, model, -2 * np.ones(3), 2 * np.ones(3), np.ones(3, bool))
-    np.testing.assert_allclose(found.log.positions[:, :2], angles[:, :2], atol=1e-9)
-    # What lies between motor and finger is not known.
-    assert found.not_logged == ("finger_joint",)
-    assert "encoder steps, 4096 a turn" in " ".join(found.warnings)
-
-
-def test_an_opening_is_not_an_angle():
-    rng = np.random.default_rng(2)
-    arm = rng.uniform(-1, 1, (20, 2))
-    model = ("panda_joint1", "panda_joint2", "finger_joint")
-    limits = -2 * np.ones(3), 2 * np.ones(3), np.ones(3, bool)
-    names = tuple(f"joint_{k}" for k in range(3))
-
-    def mapped(last, count=3):
-        log = JointLog(names, np.arange(20.0), np.column_stack([arm, last]))
-        return map_joints(log, model[:count], *(one[:count] for one in limits))
-
-    found = mapped(np.linspace(0.0, 0.7, 20))
-    assert found.not_logged == ("finger_joint",)
-    assert (
-        "'joint_2' of the joint log, 0 to 0.7, is not taken for joint 'finger_joint'"
-        in " ".join(found.warnings)
-    )
-    np.testing.assert_array_equal(found.log.positions[:, :2], arm)
-    assert mapped(np.linspace(-0.3, 0.7, 20)).not_logged == ()
-    # A name does not help if the joint's limits do not hold.
-    log = JointLog((*names[:2], "gripper"), np.arange(20.0), np.column_stack([arm, arm[:, 0] > 0]))
-    small = (*model[:2], "gripper")
-    narrow = np.array([2.0, 2.0, 0.04])
-    found = map_joints(log, small, -2 * np.array([1, 1, 0]), narrow, limits[2])
-    assert found.not_logged == ("gripper",)
-    # A model without gripper has the same arm.
-    np.testing.assert_array_equal(mapped(np.linspace(0.0, 1.0, 20), 2).log.positions, arm)
+    np.testing.assert_allclose(found.positions[:, :5], angles[:, :5], atol=STEP)
+    np.testing.assert_allclose(found.positions[:, 5], angles[:, 5], atol=0.01)
 
 
 WRONG = (0.11, -0.16, 0.05, -0.3, 0.2, 0.0)
@@ -259,14 +211,14 @@ def test_a_corrected_file_reads_the_models_angles(tmp_path, mode, robot, inverte
     angles = 0.5 * angles
     servos = read_motors(write_file(tmp_path / "arm.json", arm), robot)
     found = map_arm(log_of(arm, angles, mode, servos=servos))
-    off = np.median(angles - found.log.positions, axis=0)
+    off = np.median(angles - found.positions, axis=0)
     np.testing.assert_allclose(off[:5], WRONG[:5], atol=3 * STEP)
     # A joint map with these offsets maps the data set as recorded to the model.
     lines = [dump_column(n, one, off[NAMES.index(n)]) for n, one in found.columns.items()]
     path = tmp_path / "joint_map.yaml"
     path.write_text("".join(lines))
     again = map_arm(log_of(arm, angles, mode, servos=servos), table=read_joint_map(path))
-    np.testing.assert_allclose(again.log.positions, angles, atol=3 * STEP)
+    np.testing.assert_allclose(again.positions, angles, atol=3 * STEP)
     corrections = {}
     for joint, motor in motors_of(found):
         k = NAMES.index(joint.name)
@@ -279,8 +231,8 @@ def test_a_corrected_file_reads_the_models_angles(tmp_path, mode, robot, inverte
         read = encoder.read(angles[:, k], "deg")
         if encoder.inverted and not dynamixel:
             # Only normalised readings regard the drive mode.
-            read = encoder.read(angles[:, k], "normalised") * 180 * (encoder.high - encoder.low)
-            read = read / 100 / 4096
+            read = encoder.read(angles[:, k], "normalised")
+            read = read * 180 * (encoder.high - encoder.low) / 100 / 4096
         turned = np.mod(read - np.rad2deg(angles[:, k]) + 180, 360) - 180
         np.testing.assert_allclose(turned, 0, atol=0.3)
         assert dynamixel or abs(encoder.homing) < 2048
@@ -289,7 +241,7 @@ def test_a_corrected_file_reads_the_models_angles(tmp_path, mode, robot, inverte
 def test_a_zero_far_from_the_motors_middle_is_not_corrected(tmp_path):
     arm = {"joint4": Encoder(np.random.default_rng(0), -3.0, -0.1)}
     servos = read_motors(write_file(tmp_path / "arm.json", arm), "so100")
-    joint = ServoJoint("joint4", "joint4.pos", np.zeros(0), -3.0, -0.1, True, False, None)
+    joint = JointReadings("joint4", "joint4.pos", np.zeros(0), -3.0, -0.1, True, False, None)
     column = Column("joint4.pos", 0.01, -1.55)
     found = correct_homing(joint, "joint4", column, 0.1, servos, "normalised")
     assert found.before == found.after
@@ -310,19 +262,7 @@ def test_lists_are_corrected_in_their_own_sense(tmp_path):
         column = found.columns[joint.name]
         homing = correct_homing(joint, motor, column, off[k], servos, "deg").after
         read = np.deg2rad((counted[:, k] + homing) * 180 / 2048)
-        np.testing.assert_allclose(read, found.log.positions[:, k] + off[k], atol=STEP)
-
-
-def test_columns_without_names_have_the_files_motors_in_order(tmp_path):
-    arm, angles = arm_of(12)
-    folder = tmp_path / "set"
-    write_file(folder / "arm.json", arm)
-    names = tuple(f"joint_{k}" for k in range(6))
-    servos, warnings = find_motors(folder, "so101", names)
-    assert warnings == []
-    log = log_of(arm, angles, "steps", servos=servos)
-    found = map_arm(JointLog(names, log.times, log.positions, servos=servos))
-    np.testing.assert_allclose(found.log.positions, angles, atol=2.1 * STEP)
+        np.testing.assert_allclose(read, found.positions[:, k] + off[k], atol=STEP)
 
 
 def test_a_model_with_other_names_has_the_arms_joints_in_order(tmp_path):
@@ -334,7 +274,7 @@ def test_a_model_with_other_names_has_the_arms_joints_in_order(tmp_path):
     for count in (6, 5):
         limits = LOWER[:count], UPPER[:count], np.ones(count, bool)
         found = map_joints(log, joints[:count], *limits)
-        np.testing.assert_allclose(found.log.positions, angles[:, :count], atol=2.1 * STEP)
+        np.testing.assert_allclose(found.positions, angles[:, :count], atol=2.1 * STEP)
         assert "gripper.pos for Jaw" in found.warnings[0] or count == 5
     with pytest.raises(SceneError, match="no column of the joint log is a joint"):
         map_joints(log, ("a", "b"), LOWER[:2], UPPER[:2], np.ones(2, bool))

@@ -56,18 +56,15 @@ def test_reading_drops_an_incomplete_last_row(tmp_path):
     assert [one.frame for one in table.read()] == ["0001"]
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
+def test_a_damaged_table_or_one_of_another_model_is_refused(tmp_path):
+    for text, message in (
         ("frame,a,c,error,seconds\n", "another model"),
         ("frame,a,b,error,seconds\n1,2\n", "line 2 has 2 columns"),
         ("frame,a,b,error,seconds\n1,x,2,3,4\n", "line 2 is damaged"),
-    ],
-)
-def test_a_damaged_table_or_one_of_another_model_is_refused(tmp_path, text, message):
-    (tmp_path / "poses.csv").write_text(text)
-    with pytest.raises(OutputError, match=message):
-        PoseTable(tmp_path, NAMES, False).read()
+    ):
+        (tmp_path / "poses.csv").write_text(text)
+        with pytest.raises(OutputError, match=message):
+            PoseTable(tmp_path, NAMES, False).read()
 
 
 def test_a_folder_that_is_not_empty_or_cannot_exist_is_refused(tmp_path):
@@ -141,11 +138,17 @@ def test_files_are_written_atomically(tmp_path, monkeypatch):
     assert [path.name for path in (tmp_path / "out" / "overlay" / "cam").iterdir()] == ["1.png"]
 
 
-def test_summary_has_no_nan(tmp_path):
+def test_summary_has_no_nan_and_a_line_for_each_frame(tmp_path):
     write_summary(tmp_path, {"a": float("nan"), "b": [np.float64(1.5), np.inf], "c": np.arange(2)})
     text = (tmp_path / "summary.json").read_text()
     assert json.loads(text) == {"a": None, "b": [1.5, None], "c": [0, 1]}
     assert read_summary(tmp_path) == json.loads(text)
+    frames = {"0000": {"found": True, "joints": {"a\n": {"low": 1.0}}}, "0001": {}}
+    told = {"frames": frames, "warnings": ["ä"], "settings": {}}
+    write_summary(tmp_path, told)
+    lines = (tmp_path / "summary.json").read_text().splitlines()
+    assert read_summary(tmp_path) == told
+    assert [line.split('"')[1] for line in lines if line.startswith("    ")] == ["0000", "0001"]
 
 
 def test_only_the_same_job_is_resumed(tmp_path):
@@ -155,9 +158,8 @@ def test_only_the_same_job_is_resumed(tmp_path):
     with pytest.raises(SettingsError, match="needs the folder"):
         read_earlier_summary(None, job, resume=True)
     write_summary(tmp_path, job)
-    assert (
-        read_earlier_summary(tmp_path, job | {"settings": settings | {"frames": []}}, True) == job
-    )
+    other_frames = {"settings": settings | {"frames": []}}
+    assert read_earlier_summary(tmp_path, job | other_frames, resume=True) == job
     for other, message in (
         ({"sha256": {"model": "m", "cameras": "d"}}, "with another cameras file"),
         ({"sha256": {"model": "n", "cameras": "c"}}, "with another model file"),
@@ -167,13 +169,18 @@ def test_only_the_same_job_is_resumed(tmp_path):
             read_earlier_summary(tmp_path, job | other, resume=True)
 
 
+def begun(own_scene, out, **more):
+    scene, model = load_scene(own_scene.folder), load_model(own_scene.model)
+    made = ResultWriter(scene, model, {"scene": "s", "settings": {}}, out, **more)
+    made.begin()
+    return made
+
+
 def test_finished_frames_with_changed_masks_are_estimated_again(own_scene, tmp_path):
-    scene, model, out = load_scene(own_scene.folder), load_model(own_scene.model), tmp_path / "out"
+    scene, out = load_scene(own_scene.folder), tmp_path / "out"
 
     def writer(**more):
-        made = ResultWriter(scene, model, {"scene": "s", "settings": {}}, out, **more)
-        made.begin()
-        return made
+        return begun(own_scene, out, **more)
 
     first = writer()
     for frame, q in own_scene.truth.items():
@@ -193,12 +200,9 @@ def test_finished_frames_with_changed_masks_are_estimated_again(own_scene, tmp_p
 
 
 @pytest.mark.parametrize("row_is_written", [False, True])
-def test_ctrl_c_while_a_row_is_appended_leaves_files_that_agree(
-    own_scene, tmp_path, monkeypatch, row_is_written
-):
-    scene, model = load_scene(own_scene.folder), load_model(own_scene.model)
-    result = ResultWriter(scene, model, {"scene": "s", "settings": {}}, tmp_path)
-    result.begin()
+def test_ctrl_c_leaves_files_that_agree(own_scene, tmp_path, monkeypatch, row_is_written):
+    """While a row is appended."""
+    result = begun(own_scene, tmp_path)
     (first, q), (second, p), *_ = own_scene.truth.items()
     result.add(FrameRecord(first, q, None, 0.01, 1.0))
     append = PoseTable.append
@@ -223,11 +227,3 @@ def test_a_damaged_summary_is_named(tmp_path, text):
         (tmp_path / "summary.json").write_text(text)
     with pytest.raises(OutputError, match=r"summary\.json"):
         read_summary(tmp_path)
-
-
-def test_summary_has_a_line_for_each_frame(tmp_path):
-    frames = {"0000": {"found": True, "joints": {"a\n": {"low": 1.0}}}, "0001": {}}
-    write_summary(tmp_path, {"frames": frames, "warnings": ["ä"], "settings": {}})
-    lines = (tmp_path / "summary.json").read_text().splitlines()
-    assert read_summary(tmp_path) == {"frames": frames, "warnings": ["ä"], "settings": {}}
-    assert [line.split('"')[1] for line in lines if line.startswith("    ")] == ["0000", "0001"]

@@ -38,9 +38,8 @@ def test_csv_has_the_joint_centres_of_frames_with_a_pose(centres):
     rows = list(csv.DictReader(io.StringIO(centres_as_csv(["0", "1", "2"], names, places))))
     assert len(rows) == 2 * len(names)
     at = {(row["frame"], row["joint"]): [float(row[axis]) for axis in "xyz"] for row in rows}
-    hanging, raised = (
-        np.subtract(at[frame, "left_wrist"], at[frame, "left_elbow"]) for frame in ("0", "1")
-    )
+    wrist, elbow = (np.array([at[f, f"left_{one}"] for f in "01"]) for one in ("wrist", "elbow"))
+    hanging, raised = wrist - elbow
     # The forearm points forward, along the world's x.
     assert raised[2] == pytest.approx(0.0, abs=0.03)
     assert raised[0] > 0.2

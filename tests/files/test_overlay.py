@@ -1,18 +1,8 @@
 import cv2
 import numpy as np
 
-from drake_pose.files.overlay import (
-    AGREEMENT_RGB,
-    BACKGROUND_RGB,
-    EXCESS_RGB,
-    MISSING_RGB,
-    OUTLINE_RGB,
-    PALETTE,
-    draw_overlay,
-    draw_shapes,
-    encode_png,
-    paint_agreement,
-)
+from drake_pose.files import overlay
+from drake_pose.files.overlay import PALETTE, draw_overlay, draw_shapes, paint_agreement
 
 
 def rectangle(shape, rows, columns):
@@ -30,10 +20,10 @@ def test_agreement_missing_and_excess_have_their_colours():
     body = rectangle((6, 8), slice(1, 5), slice(3, 7))
     picture = paint_agreement(mask, body)
     for colour, (row, column), pixels in (
-        (BACKGROUND_RGB, (0, 0), 24),
-        (MISSING_RGB, (2, 1), 8),
-        (AGREEMENT_RGB, (2, 3), 8),
-        (EXCESS_RGB, (2, 6), 8),
+        (overlay.BACKGROUND_RGB, (0, 0), 24),
+        (overlay.MISSING_RGB, (2, 1), 8),
+        (overlay.AGREEMENT_RGB, (2, 3), 8),
+        (overlay.EXCESS_RGB, (2, 6), 8),
     ):
         assert tuple(picture[row, column]) == colour
         assert count(picture, colour) == pixels
@@ -43,14 +33,14 @@ def test_borders_are_pixels_of_the_body_before_another_segment():
     """To the right or below, both within the body."""
     rng = np.random.default_rng(3)
     body, segments = rng.random((12, 15)) < 0.8, rng.integers(0, 3, (12, 15))
-    drawn = (paint_agreement(body, body, segments) == OUTLINE_RGB).all(axis=2)
+    drawn = (paint_agreement(body, body, segments) == overlay.OUTLINE_RGB).all(axis=2)
     for v, u in np.ndindex(12, 15):
         differs = any(
             a < 12 and b < 15 and body[a, b] and segments[a, b] != segments[v, u]
             for a, b in ((v, u + 1), (v + 1, u))
         )
         assert drawn[v, u] == (body[v, u] and differs)
-    assert count(paint_agreement(body, body), OUTLINE_RGB) == 0
+    assert count(paint_agreement(body, body), overlay.OUTLINE_RGB) == 0
 
 
 def test_a_large_overlay_is_cropped_to_the_body():
@@ -58,7 +48,11 @@ def test_a_large_overlay_is_cropped_to_the_body():
     body = rectangle((1900, 1100), slice(1000, 1600), slice(310, 610))
     picture = PALETTE[draw_overlay(mask, body, None, "title")]
     assert max(picture.shape) < 900
-    for colour, columns in ((MISSING_RGB, 10), (EXCESS_RGB, 10), (AGREEMENT_RGB, 290)):
+    for colour, columns in (
+        (overlay.MISSING_RGB, 10),
+        (overlay.EXCESS_RGB, 10),
+        (overlay.AGREEMENT_RGB, 290),
+    ):
         assert count(picture, colour) >= 600 * columns
 
 
@@ -70,16 +64,19 @@ def test_shapes_are_contours_over_the_silhouette():
     picture = draw_shapes(mask, [first, corrected], names, "title")
     legend = draw_shapes(mask, [np.zeros_like(mask)] * 2, names, "title")
     # The upper and lower sides coincide, and the second contour covers the first.
-    for colour, own in ((MISSING_RGB, 2 * 400 + 2 * 100), (EXCESS_RGB, 2 * 400 + 2 * 200)):
+    for colour, own in (
+        (overlay.MISSING_RGB, 2 * 400 + 2 * 100),
+        (overlay.EXCESS_RGB, 2 * 400 + 2 * 200),
+    ):
         shown = count(picture, colour) - count(legend, colour)
         assert own < shown < 4 * own
-    assert count(picture, AGREEMENT_RGB) > 0.95 * 400 * 400
+    assert count(picture, overlay.AGREEMENT_RGB) > 0.95 * 400 * 400
 
 
 def test_a_small_overlay_is_enlarged_by_an_integer_without_text_on_it():
     whole, none = np.ones((40, 40), dtype=bool), np.zeros((40, 40), dtype=bool)
     drawn = [PALETTE[draw_overlay(whole, body, None, "t")] for body in (none, whole)]
-    shown = [count(picture, MISSING_RGB) for picture in drawn]
+    shown = [count(picture, overlay.MISSING_RGB) for picture in drawn]
     scale = int(np.sqrt((shown[0] - shown[1]) / 40**2))
     assert scale > 1
     assert shown[0] - shown[1] == (40 * scale) ** 2
@@ -88,5 +85,6 @@ def test_a_small_overlay_is_enlarged_by_an_integer_without_text_on_it():
 def test_png_of_rgb_and_of_palette_indices_are_equal():
     numbers = np.arange(len(PALETTE), dtype=np.uint8).reshape(4, -1)
     for picture in (numbers, PALETTE[numbers]):
-        decoded = cv2.imdecode(np.frombuffer(encode_png(picture), np.uint8), cv2.IMREAD_COLOR)
+        data = np.frombuffer(overlay.encode_png(picture), np.uint8)
+        decoded = cv2.imdecode(data, cv2.IMREAD_COLOR)
         np.testing.assert_array_equal(decoded[..., ::-1], PALETTE[numbers])

@@ -15,9 +15,10 @@ from pydrake.geometry import Meshcat, MeshcatParams
 
 from drake_pose.body import bundled_model, load_model
 from drake_pose.camera.models import ParallelCamera, PinholeCamera, look_at
-from drake_pose.files.records import FrameRecord, SceneEstimate, summarize
+from drake_pose.errors import weight_of, weighted
+from drake_pose.files.page import Page, estimate_page, next_steps, plot, without_folders
+from drake_pose.files.records import FrameRecord, SceneEstimate, describe_warnings, summarize
 from drake_pose.files.replay import make_replay
-from drake_pose.files.report_page import draw_grid, make_report, plot_curves, plot_uri
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.silhouette.pictures.scenes import Scene
@@ -25,26 +26,22 @@ from tests.body.models import link_poses
 from tests.jobs.scenes import NAMES, camera, read_rows
 
 
-class Page:
-    """A parsed page: tables, texts by id, and figures; every tag must be closed."""
+class ParsedPage:
+    """A parsed page: tables, texts by id, and figures by title; every tag must be closed."""
 
     def __init__(self, text):
         text = re.sub(r"<!doctype[^>]*>", "", text, flags=re.IGNORECASE)
-        text = re.sub(r"<(meta|img|br|link|hr)\b([^>]*?)/?>", r"<\1\2/>", text)
-        self.root = ElementTree.fromstring(text.replace("&middot;", "."))
+        self.root = ElementTree.fromstring(re.sub(r"<img\b([^>]*)>", r"<img\1/>", text))
         every = [*self.root.iter()]
         self.tags = [one.tag for one in every]
-        self.classes = [name for one in every for name in one.get("class", "").split()]
         self.by_id = {one.get("id"): "".join(one.itertext()) for one in every if one.get("id")}
         self.tables = [
             [["".join(cell.itertext()) for cell in row] for row in table.iter("tr")]
             for table in self.root.iter("table")
         ]
-        self.plots = {}
-        for figure in self.root.iter("figure"):
-            if (drawn := figure.find("img[@class='plot']")) is not None:
-                label = drawn.get("alt").split(" by frame")[0]
-                self.plots[figure.get("data-joint") or label] = figure
+        titled = [one for one in self.root.iter("figure") if one.find("h3") is not None]
+        self.plots = {one.find("h3").text: one for one in titled}
+        self.links = [one.get("href") for one in self.root.iter("a")]
         assert all(one.get("alt") for one in self.root.iter("img"))
 
     def table(self, *head):
@@ -53,17 +50,65 @@ class Page:
 
 
 def require_plain_page(text, warnings=()):
-    """Check that the answer is the first text, each warning stands once, and decimals are few."""
-    page = Page(text)
-    body = [part.strip() for part in page.root.find("body").itertext() if part.strip()]
+    """Check what holds for all pages.
+
+    The answer is the first text; each warning stands once; numbers have few decimals and are known;
+    no cell is a dash; no path of the machine is shown.
+    """
+    page, again = ParsedPage(text), ParsedPage(text)
+    for drawn in again.root.iter("svg"):
+        drawn[:] = []  # Labels of axes.
+    body = [part.strip() for part in again.root.find("body").itertext() if part.strip()]
     assert body[0] == page.by_id["answer"]
     shown = " ".join(body)
-    for number, warning in enumerate(dict.fromkeys(warnings), 1):
-        assert page.by_id[f"warning-{number}"] == warning
+    for warning in dict.fromkeys(map(without_folders, warnings)):
         assert shown.count(warning) == 1
-    assert f"warning-{len({*warnings}) + 1}" not in page.by_id
-    assert not re.search(r"\d\.\d{4}|\de-\d", shown)
+    assert not re.search(r"\d\.\d{4}|\de-\d|\bnan\b|(?<![\w.<])/(tmp|work|home|root)/", shown)
+    assert not {"-", "–", ""} & {cell for table in page.tables for row in table for cell in row}
     return page
+
+
+def test_paths_of_the_machine_are_not_shown():
+    for text, shown in (
+        ("/data/a b/masks/0.png: is black", "a b/masks/0.png: is black"),
+        ("in '/data/set/cameras.yaml' (line 3)", "in 'cameras.yaml' (line 3)"),
+        ("12 mm/s and 3/4, see ros/front.yaml", "12 mm/s and 3/4, see ros/front.yaml"),
+    ):
+        assert without_folders(text) == shown
+
+
+def test_weights_of_warnings_order_them_and_only_one_changes_the_headline(tmp_path):
+    notes = [weighted(text, "note") for text in ("mesh is not watertight", "the model is large")]
+    texts = [notes[0], "a camera moved", weighted("exchanged", "wrong"), notes[1]]
+    for kept in (texts, texts[:2], texts[:1]):
+        told = describe_warnings([*kept, *kept])
+        assert told["warnings"] == kept
+        Page("t", "", "All right.", told, {}).write(tmp_path)
+        page = require_plain_page((tmp_path / "report.html").read_text(), kept)
+        assert page.by_id["answer"].startswith("Wrong answer likely") == (kept is texts)
+        heads, count = [one.text for one in page.root.iter("h2")], len({*map(weight_of, kept)})
+        assert ("What to do next" in heads) == (kept is texts)
+        assert heads[-count:] == ["Wrong answer likely", "To check", "Notes"][-count:]
+
+
+def test_files_are_named_with_their_use_and_frame(tmp_path):
+    for name in ("cameras.yaml", "mujoco.xml", "arm_calibrated.urdf", "cameras_2.yaml", "x.png"):
+        (tmp_path / name).write_text("")
+    for name in ("lerobot", "ros"):
+        (tmp_path / name).mkdir()
+    world = dict(next_steps(tmp_path, {"cameras": {"front": {}}}))
+    files = "cameras.yaml arm_calibrated.urdf lerobot/ ros/ mujoco.xml cameras_2.yaml"
+    assert " ".join(world) == files
+    masks = {"mask_count": 2, "cameras": {"front": {}}}
+    assert dict(next_steps(tmp_path, masks))["cameras.yaml"] == "the cameras as they were given"
+    wrist = dict(next_steps(tmp_path, {"cameras": {"wrist": {"link": "hand"}}}))
+    for name, of_world, of_link in (
+        ("cameras.yaml", "the robot's world", "frame of link hand"),
+        ("mujoco.xml", "worldbody", "body hand"), ("ros/", "the robot's world", "link hand"),
+    ):  # fmt: skip
+        assert of_world in world[name]
+        assert of_link in wrist[name]
+        assert of_world not in wrist[name]
 
 
 @pytest.fixture(scope="module")
@@ -83,41 +128,44 @@ def test_page_agrees_with_poses_and_summary(result):
         assert row[:2] == [pose["frame"], "found"]
         assert float(row[2].rstrip(" %")) == pytest.approx(error, abs=0.051)
     for name in NAMES:
-        text = "".join(page.plots[name].find("figcaption").itertext())
         values = np.degrees([float(pose[name]) for pose in poses])
-        numbers = [float(number) for number in re.findall(r"-?\d+\.?\d*(?:e-?\d+)?", text)]
-        np.testing.assert_allclose(numbers[:2], [values.min(), values.max()], atol=0.051)
-    assert {"E_total", "Intersection over union of each camera", *NAMES} <= {*page.plots}
-    ious = [f"{100.0 * np.mean([one['ious']['front'] for one in records]):.1f} %"]
-    assert page.table("camera")[1][3:4] == ious
-    mean = np.mean(errors)
+        (row,) = (row for row in page.table("joint") if row[0] == name)
+        numbers = [float(number) for number in re.findall(r"-?\d+\.\d+", row[1])]
+        np.testing.assert_allclose(numbers, [values.min(), values.max()], atol=0.051)
+        (path,) = (one for one in page.plots[name].iter("path") if "cestimate" in one.get("class"))
+        drawn = np.array([float(y) for y in re.findall(r"[ML][\d.]+ ([\d.]+)", path.get("d"))])
+        slope, offset = np.polyfit(values, drawn, 1)
+        assert slope < 0.0
+        np.testing.assert_allclose(slope * values + offset, drawn, atol=0.1)
+    assert {"E_total [%]", "IoU [%]", *NAMES} == {*page.plots}
+    ious = f"{100.0 * np.mean([one['ious']['front'] for one in records]):.1f} %"
+    assert page.table("camera")[1][:4] == ["front", "3", "3", ious]
     assert page.by_id["answer"] == (
-        f"2 of 2 joints determined in 3 of 3 frames; mean error {mean:.1f} % of the silhouette."
+        f"Pose found in 3 of 3 frames; body and silhouettes differ by {np.mean(errors):.1f} % of "
+        "their area. All 2 joints are determined in all frames."
     )
-    assert page.table("camera")[1][:3] == ["front", "3", "3"]
-    # Pictures are of the worst, the middle and the best frame.
-    links = [one.get("href") for one in page.root.iter("a")]
-    in_order = sorted(poses, key=lambda pose: -float(pose["error"]))
-    names = [f"overlay/front/{pose['frame']}.png" for pose in in_order]
-    assert [one for one in links if one.startswith("overlay/")] == names
-    for bar in (one for one in page.root.iter("rect") if one.get("class") != "limits"):
-        assert 0.0 <= float(bar.get("x")) <= 100.0 - float(bar.get("width"))
+    # Pictures are of the middle frame, with its modes, then of the worst and the best.
+    in_order = [pose["frame"] for pose in sorted(poses, key=lambda pose: -float(pose["error"]))]
+    shown = [one for one in page.links if one.endswith(".png")]
+    assert shown[:2] == [f"overlay/front/{in_order[1]}.png", f"overlay_modes/{in_order[1]}.png"]
+    assert shown[2:] == [f"overlay/front/{in_order[k]}.png" for k in (0, 2)]
+    for part in page.root.iter("rect"):
+        assert 0.0 <= float(part.get("x")) <= 100.0 - float(part.get("width"))
     assert "No warnings." in page.by_id["warnings"]
 
 
 def test_page_is_self_contained_and_its_links_exist(result):
     text = (result / "report.html").read_text()
-    page = Page(text)
+    page = ParsedPage(text)
     assert "http" not in re.sub(r"data:image/\w+;base64,[\w+/=]*", "", text)
     assert not {"script", "link", "iframe"} & {*page.tags}
-    drawn = cv2.imread(str(next(result.glob("overlay/front/*.png"))))
-    assert "img" in page.tags
     for image in page.root.iter("img"):
         data = base64.b64decode(image.get("src").partition("base64,")[2])
         small = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-        assert small.shape[0] <= min(drawn.shape[0], 400)
-    for link in (one.get("href") for one in page.root.iter("a")):
-        assert link.removeprefix("#") in page.by_id or (result / link).is_file(), link
+        assert max(small.shape) <= 900
+    assert page.links
+    for link in page.links:
+        assert (result / link).exists(), link
 
 
 @pytest.fixture(scope="module")
@@ -145,28 +193,32 @@ def report():
         masks["<b>left</b>", frame] = Path()
         if k % 80:
             masks["right & low", frame] = Path()
-    more = {"method": "person", "warnings": ["camera '<b>left</b>' agrees badly"]}
+    more, warnings = {"method": "person"}, ["camera '<b>left</b>' agrees badly"]
     job = {"scene": "/data/<script>", "model": "person.urdf"}
     cameras = {name: camera(name) for name in ("<b>left</b>", "right & low")}
     scene = Scene(Path("nowhere"), cameras, tuple(records), masks, True)
-    estimate = SceneEstimate(
-        model.position_names, model.position_kinds, records,
-        summarize(job, records, True, more), None,
-    )  # fmt: skip
-    return model, scene, estimate
+    summary = summarize(job, records, True, more, warnings)
+    names = model.position_names, model.position_kinds
+    return model, scene, SceneEstimate(*names, records, summary, None)
 
 
-def test_page_of_a_thousand_frames_is_small_and_escapes_names(report):
-    text = make_report(Path("nowhere"), *report)
+def page_text(folder, *estimate):
+    """Return the text of an estimate's page."""
+    estimate_page(folder, *estimate).write(folder)
+    return (folder / "report.html").read_text()
+
+
+def test_page_of_a_thousand_frames_is_small_and_escapes_names(report, tmp_path):
+    text = page_text(tmp_path, *report)
     assert len(text) < 2_500_000
     page = require_plain_page(text, report[2].summary["warnings"])
-    assert page.by_id["answer"].startswith("Pose found in 980 of 1000 frames; mean error 10.0 %")
+    answer = page.by_id["answer"]
+    assert answer.startswith("Pose found in 980 of 1000 frames; body and silhouettes differ by 10.")
     (row,) = (row for row in page.table("joint") if row[0] == "left_thigh_stretch")
-    assert row[1:4] == ["20.0", "± 20.0", "mm"]
+    assert row[1:3] == ["20.0 mm", "± 20.0 mm"]
     assert not {"b", "script"} & {*page.tags}
     _, left, right = page.table("camera")
     assert [left[0], right[0]] == ["<b>left</b>", "right & low"]
-    assert left[6] == "warning 1"
     assert right[1:3] == ["987", "955"]
     assert "camera '<b>left</b>' agrees badly" in page.by_id["warnings"]
 
@@ -177,89 +229,50 @@ def part(whole, frames, errors=None, **changes):
     for frame, off in (errors or {}).items():
         records[frame] = replace(records[frame], joint_errors=off)
     names = {name: {"mean": 3.0, "largest": 3.0} for off in (errors or {}).values() for name in off}
-    return replace(whole, records=records, summary=whole.summary | {"joint_errors": names})
+    told = {"joint_errors": names, **describe_warnings(())}
+    return replace(whole, records=records, summary=whole.summary | told)
 
 
-def test_page_of_one_frame_has_a_table_and_no_plots(report):
+def test_page_of_one_frame_has_a_table_and_no_plots(report, tmp_path):
     """The table has estimate, interval and measured position; a frame without a pose has no row."""
     model, scene, whole = report
     name = "left_forearm_x"
     for frame, off in (("0000", {name: -4.0}), ("0100", {})):
-        page = Page(make_report(Path("nowhere"), model, scene, part(whole, [frame], {frame: off})))
-        assert not {*page.plots} & {name, "E_total"}
+        told = part(whole, [frame], {frame: off})
+        page = require_plain_page(page_text(tmp_path, model, scene, told), [])
+        assert not page.plots
         rows = [row for table in page.tables for row in table if row[0] == name]
         assert len(rows) == len(off)
         for row in rows:
-            value = np.degrees(whole.records[frame].q[model.position_index(name)])
-            numbers = [
-                float(number) for number in re.findall(r"-?\d+\.\d+", " ".join([*row[1:3], row[7]]))
-            ]
-            unit = np.degrees(0.02)
-            expected = [value, value - unit, value + unit, value + 4.0]
-            np.testing.assert_allclose(numbers, expected, atol=0.051)
-            assert row[3:5] == ["deg", "no"]
+            value, half = np.degrees([whole.records[frame].q[model.position_index(name)], 0.02])
+            assert row[1] == f"{value:.1f} deg"
+            assert row[2] == f"{value - half:.1f} to {value + half:.1f} deg"
+            assert row[3] == "no"
+            assert row[5:] == [f"{value + 4.0:.1f} deg", "3.0, max. 3.0 deg"]
 
 
-def plotted(values, **more):
-    """Return the axes of a plot with one curve, and the curve."""
-    names = [str(k) for k in range(len(values))]
-    (axes,) = plot_curves(names, [("one", values)], **{"joined": True, **more}).axes
-    return axes, axes.get_lines()[0]
+def drawn_paths(**given):
+    """Return (class, points) of each path of a plot of four values; V gives the second y."""
+    known = {"curves": [("estimate", np.array([0.0, 1.0, np.nan, 3.0]))], "labels": [*"abcd"]}
+    root = ElementTree.fromstring(plot(**(known | {"about": "x"} | given)))
+    return {
+        one.get("class"): [float(x) for x in re.findall(r"-?\d+\.?\d*", one.get("d"))]
+        for one in root.iter("path")
+        if one.get("class") != "axis"
+    }
 
 
-def test_a_plot_drawn_onto_another_is_the_same_as_a_new_one():
-    frames, rng = [f"{k:03d}" for k in range(40)], np.random.default_rng(0)
-    for values, limits in ((rng.normal(size=(4, 40)), (-3.0, 90.0)), (rng.random((4, 40)), None)):
-        given = {
-            "values": [("measured", values[0]), ("one", values[1])],
-            "joined": True,
-            "limits": limits,
-            "intervals": (values[2], values[3], rng.random(40) < 0.5),
-        }
-        first = plot_curves(frames, [("one", 1e3 * values[1])], joined=True, limits=(0.0, 1.0))
-        again = plot_curves(frames, **given, onto=first)
-        assert plot_uri(again) == plot_uri(plot_curves(frames, **given))
-
-
-def test_plots_show_only_limits_that_are_near():
-    values = np.sin(np.linspace(0.0, 20.0, 5000))
-    values[2500], values[1000:1100] = 3.0, np.nan
-    axes, curve = plotted(values, limits=(-1, 4))
-    np.testing.assert_array_equal(curve.get_ydata(), values)
-    np.testing.assert_array_equal(curve.get_xdata(), np.arange(5000))
-    assert [line.get_ydata()[0] for line in axes.get_lines()[1:]] == [-1, 4]
-    low, high = axes.get_ylim()
-    assert low < -1 < 4 < high
-    # Distant limits do not change the scale.
-    axes, _ = plotted(np.linspace(0.0, 1.0, 50), limits=(-90, 90))
-    assert np.ptp(axes.get_ylim()) < 1.3
-    assert len(axes.get_lines()) == 1
-    axes, _ = plotted(np.array([0.3, 0.4]), least=0.0)
-    assert axes.get_ylim()[0] == 0.0
-
-
-def test_stills_are_dots_and_intervals_are_at_their_frames():
-    _, curve = plotted(np.array([1.0, np.nan]), joined=False)
-    assert curve.get_linestyle() == "None"
-    known = np.array([True, False, True])
-    low, high = np.array([0.0, 1.0, 2.0]), np.array([1.0, 3.0, 5.0])
-    axes, _ = plotted(np.ones(3), intervals=(low, high, known))
-    of_known, of_open = ([s.tolist() for s in one.get_segments()] for one in axes.collections)
-    assert of_known == [[[0, 0], [0, 1]], [[2, 2], [2, 5]]]
-    assert of_open == [[[1, 1], [1, 3]]]
-
-
-def test_grid_joins_equal_neighbours():
-    states = ["used", "used", "no-picture", "used"]
-    (axes,) = draw_grid(["0", "1", "2", "3"], [("left", states), ("right", states)]).axes
-    rows = [[path.get_extents() for path in one.get_paths()] for one in axes.collections]
-    # The bars of a row are at its name, and rows do not overlap.
-    assert [one.y0 + one.y1 for row in rows for one in row] == pytest.approx([0.0] * 3 + [2.0] * 3)
-    assert rows[0][0].y1 < rows[1][0].y0
-    spans = rows[0]
-    assert [(one.x0, one.x1) for one in spans] == [(-0.5, 1.5), (1.5, 2.5), (2.5, 3.5)]
-    first, second, third = axes.collections[0].get_facecolors().tolist()
-    assert first == third != second
+def test_plots_have_gaps_dots_bands_and_limits_that_are_near():
+    joined = drawn_paths()["curve cestimate"]
+    # M x y h0 L x y, and after the gap M x y h0.
+    assert len(joined) == 8
+    assert len(drawn_paths(joined=False)["curve cestimate dots"]) == 9
+    low, high = np.array([0.0, np.nan, 1.0, 2.0]), np.array([1.0, np.nan, 2.0, 3.0])
+    band = drawn_paths(bands=[("known", low, high)])["known"]
+    assert len(band) == 9
+    assert band[1] > band[2]
+    assert "limit" in drawn_paths(limits=(-1.0,))
+    assert "limit" not in drawn_paths(limits=(-90.0, np.inf))
 
 
 def played(page):
@@ -273,6 +286,12 @@ def played(page):
     return told
 
 
+def points_of(command):
+    """Return the points (n, 3) of a command's object."""
+    data = command["object"]["geometries"][0]["data"]["attributes"]["position"]["array"].data
+    return np.frombuffer(data, np.float32).reshape(-1, 3).astype(float)
+
+
 def test_replay_shows_body_cameras_and_measured_ghost(tiny_scene):
     model = load_model(tiny_scene.model, check=False)
     q, off = np.array([*tiny_scene.truth.values()]), np.array([0.3, -0.1])
@@ -283,20 +302,16 @@ def test_replay_shows_body_cameras_and_measured_ghost(tiny_scene):
     told = played(make_replay(model, q, X_WB, [left, flat], 2.0, q + off))
     corners = {(u - 0.5, v - 0.5) for u in (0, 200) for v in (0, 160)}
     for one in (left, flat):
-        geometry = told["set_object", f"/drake/cameras/{one.name}"]["object"]["geometries"][0]
-        data = geometry["data"]["attributes"]["position"]["array"].data
-        p_W = np.frombuffer(data, np.float32).reshape(-1, 3).astype(float)
+        p_W = points_of(told["set_object", f"/drake/cameras/{one.name}"])
         pixels, depth = one.project(p_W[np.linalg.norm(p_W - one.X_WC[:3, 3], axis=1) > 1e-6])
         assert {tuple(row) for row in np.round(pixels, 2).tolist()} == corners
         assert 0.0 < depth.max() < 2.5
     # Meshcat's y is up; the body fills a good part of its field of view of 75 degrees.
     view = told["set_property", "/Cameras/default/rotated/<object>"]["value"]
     eye, target = (np.array([x, -z, y]) for x, y, z in (view, told["set_target", None]["value"]))
-    pinhole = PinholeCamera(
-        "view", 1000, 1000, *[500.0 / np.tan(np.radians(37.5))] * 2, 499.5, 499.5,
-        look_at(eye, target),
-    )  # fmt: skip
-    seen = []
+    focal, seen = 500.0 / np.tan(np.radians(37.5)), []
+    X_WC = look_at(eye, target)
+    pinhole = PinholeCamera("view", 1000, 1000, focal, focal, 499.5, 499.5, X_WC)
     tracks = {
         one["path"]: {track["name"]: track["keys"] for track in one["clip"]["tracks"]}
         for one in told["set_animation", None]["animations"]
@@ -316,8 +331,7 @@ def test_replay_shows_body_cameras_and_measured_ghost(tiny_scene):
                     np.testing.assert_allclose(found[step], X_WL[:3, 3], atol=1e-9)
     pixels, depth = pinhole.project(np.concatenate(seen))
     assert depth.min() > 0.0
-    assert (pixels >= -0.5).all()
-    assert (pixels <= 999.5).all()
+    assert -0.5 <= pixels.min() <= pixels.max() <= 999.5
     assert np.ptp(pixels, axis=0).max() > 300.0
     # The view is from the side of the first camera.
     directions = [place - target for place in (eye, left.X_WC[:3, 3])]
@@ -338,10 +352,6 @@ def test_replay_of_many_triangles_is_small_and_accurate(tmp_path):
     empty = Meshcat(MeshcatParams(host="localhost", port=0)).StaticHtml()
     assert len(page) - len(empty) < 0.4e6
     told = played(page)
-    (ghost,) = (
-        one["object"]["geometries"][0]["data"]["attributes"]["position"]["array"].data
-        for (kind, path), one in told.items()
-        if kind == "set_object" and "measured" in path
-    )
-    points = np.frombuffer(ghost, np.float32).reshape(-1, 3) - [0.3, 0.0, 0.0]
+    (path,) = (one for one in told if one[0] == "set_object" and "measured" in one[1])
+    points = points_of(told[path]) - [0.3, 0.0, 0.0]
     np.testing.assert_allclose(np.linalg.norm(points / [1, 2, 1], axis=1), 0.1, atol=0.003)

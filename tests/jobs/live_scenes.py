@@ -32,13 +32,9 @@ def absent(person: ArticulatedModel) -> np.ndarray:
 
 
 def write_studio(
-    folder: Path,
-    person: ArticulatedModel,
-    poses: list[np.ndarray],
-    kind: str,
-    cameras: int = 3,
+    folder: Path, person: ArticulatedModel, poses: list[np.ndarray], kind: str, cameras: int = 3,
     size: tuple[int, int] = SIZE,
-) -> None:
+) -> None:  # fmt: skip
     """Write a live scene: noisy videos with backgrounds, or folders of masks."""
     placed = circle_of_cameras(cameras, size=size, radius=2.6, face_camera=False)
     save_cameras(folder / "cameras.yaml", placed)

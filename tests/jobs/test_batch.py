@@ -26,6 +26,7 @@ from drake_pose.jobs.batch_tasks import Outcome, SceneJob, Task, perform, plan_s
 from drake_pose.jobs.cluster import call_in_child, open_cluster, require_fit_workers
 from drake_pose.jobs.estimate.scene import estimate_scene
 from tests.cli import run_to_end
+from tests.files.test_report_page import require_plain_page
 from tests.jobs.scenes import write_scene
 
 MOTION = [(20.0 + 5.0 * k, -40.0 - 4.0 * k) for k in range(5)]
@@ -80,7 +81,12 @@ def slow(task: Task) -> Outcome:
 
 
 def test_joined_chunks_equal_the_whole_scene(jobs, alone, scenes, tmp_path):
-    assert sorted(path.name for path in alone.iterdir()) == ["batch.json", "motion", "stills"]
+    names = ["batch.json", "motion", "report.html", "stills"]
+    assert sorted(path.name for path in alone.iterdir()) == names
+    page = require_plain_page((alone / "report.html").read_text())
+    assert page.by_id["answer"] == "2 of 2 scenes finished."
+    for name in ("stills", "motion"):
+        assert f"{name}/report.html" in page.links
     plain = tmp_path / "plain"
     estimate_scene(
         scenes / "stills", scenes / "crane.urdf", plain, jobs[0].settings, replay=False,
@@ -257,7 +263,8 @@ def test_job_file_gives_the_settings(tmp_path):
         ("scenes: {a: {scene: a, methode: beam}}", "unknown field methode; there are: scene"),
         ("scenes: {a: {scene: a, every: wide}}", "every: must be a whole number"),
         ("scenes: {a: {scene: a, every: true}}", "every: must be a whole number"),
-        ("scenes: {a: {scene: a, time_limit: 5}}", "--time-limit is gone"),
+        ("scenes: {a: {scene: a, time_limit: 5}}", f"--time-limit is gone: {GONE['--time-limit']}"),
+        ("scenes: {a: {}}\ndefaults: {time_limit: 1}", "--time-limit is gone: "),
         ("scenes: {a: {scene: a, track: 1}}", "track: must be true or false"),
         ("scenes: {a: {scene: a, hold: {lift: low}}}", "hold: lift: must be a number"),
         ("scenes: {a: {scene: a, packages: [b]}}", "packages: expected NAME: VALUE"),
@@ -279,15 +286,6 @@ def test_job_file_is_checked(text, words, tmp_path):
     with pytest.raises(SettingsError, match=r"jobs\.yaml") as caught:
         read_job(path)
     assert words in str(caught.value)
-
-
-def test_keys_that_are_gone_name_what_to_use_instead(tmp_path, monkeypatch):
-    monkeypatch.setitem(GONE, "--old-key", "use the new one")
-    path = tmp_path / "jobs.yaml"
-    for text in ("scenes: {a: {scene: a, old_key: 1}}", "scenes: {a: {}}\ndefaults: {old_key: 1}"):
-        path.write_text(text)
-        with pytest.raises(SettingsError, match="--old-key is gone: use the new one"):
-            read_job(path)
 
 
 def finish(task: Task) -> Outcome:

@@ -4,7 +4,6 @@ import csv
 import io
 import json
 
-import cv2
 import numpy as np
 import pytest
 import yaml
@@ -16,8 +15,9 @@ from drake_pose.errors import SettingsError
 from drake_pose.files.settings import AuditSettings
 from drake_pose.jobs.batch import run_batch
 from drake_pose.jobs.batch_tasks import Outcome, plan_scene, read_job
-from drake_pose.jobs.episodes_table import COLUMNS, episodes_table
+from drake_pose.jobs.episodes_table import COLUMNS, batch_page, episodes_table
 from tests.cli import run_to_end
+from tests.files.test_report_page import require_plain_page
 from tests.jobs.scenes import read_rows
 from tests.registration.episodes import painted_episode
 from tests.registration.recordings import write_episode
@@ -53,7 +53,7 @@ def test_a_significant_difference_to_earlier_episodes_is_a_move(tmp_path):
         "failed": {},
         "again": totals([1.0, 0.02, 0.5], 1.0),
     }
-    found, moves = episodes_table(episodes, is_drawn=True)
+    found, moves = episodes_table(episodes)
     rows = rows_of(found)
     assert tuple(rows[0]) == COLUMNS
     assert [row["moved"] for row in rows] == ["", "no", "yes", "no"]
@@ -70,11 +70,13 @@ def test_a_significant_difference_to_earlier_episodes_is_a_move(tmp_path):
     assert moves[1:] == (
         "camera 'left', pose 1: first, same", "camera 'left', pose 2: bumped, again"
     )  # fmt: skip
-    assert (
-        cv2.imdecode(np.frombuffer(found["episodes.png"], np.uint8), cv2.IMREAD_COLOR) is not None
-    )
-    none = episodes_table({"scene": {"frame_count": 3, "agreeing_count": 3}}, is_drawn=True)
-    assert none == ({}, ())
+    assert episodes_table({"scene": {"frame_count": 3, "agreeing_count": 3}}) == ({}, ())
+    one = {"state": "finished", "errors": [], "frame_count": 8, "agreeing_count": 8, "findings": []}
+    content = {"scenes": dict.fromkeys(episodes, one), "moves": moves}
+    batch_page(tmp_path, content, episodes).write(tmp_path)
+    page = require_plain_page((tmp_path / "report.html").read_text())
+    assert page.by_id["answer"].startswith(f"5 of 5 scenes finished. C{moves[0][1:]}.")
+    assert {"left: shift [mm]", "left: turn [deg]"} <= {*page.plots}
 
 
 def test_a_camera_that_is_put_back_shares_its_earlier_pose():
@@ -175,7 +177,7 @@ def test_episodes_are_audited_in_a_batch(tmp_path, out):
             assert row["off_mm"] == ""
             place = [float(row[name]) for name in "xyz"]
             np.testing.assert_allclose(place, painted.camera.X_WC[:3, 3], atol=0.01)
-        assert (out / "episodes.png").is_file()
+        assert "shift [mm]" in (out / "report.html").read_text()
     seconds = [json.loads((out / k / "summary.json").read_text())["seconds"] for k in scenes]
     assert seconds[1] < seconds[0]
     assert json.loads((out / "batch.json").read_text())["scenes"]["one"]["state"] == "finished"

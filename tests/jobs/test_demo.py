@@ -19,7 +19,7 @@ def test_demo(tmp_path):
     (camera,) = scene.cameras.values()
     (frame,) = scene.frames
     overlay = out / "overlay" / camera.name / f"{frame}.png"
-    for part in ("left_upper_arm_x", "E_total", "seconds", str(overlay)):
+    for part in ("left_upper_arm_x", "Pose found", "start here", str(overlay)):
         assert part in result.stdout
     assert overlay.is_file()
     (row,) = read_rows(out / "poses.csv")

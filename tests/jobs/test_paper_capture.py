@@ -84,4 +84,4 @@ def test_inputs_unfit_for_the_paper_method_are_refused(tmp_path, person):
     (tmp_path / "sources.yaml").unlink()
     done = run_command(words)
     assert done.exit_code == 1
-    assert "has no sources.yaml" in done.stderr
+    assert "sources.yaml" in done.stderr

@@ -20,6 +20,11 @@ def looking_at(place: np.ndarray, middle: np.ndarray, roll: float) -> PinholeCam
     return PinholeCamera("eye", 640, 480, 600.0, 600.0, 319.5, 239.5, X_WC)
 
 
+def shifted(camera: PinholeCamera, *by: float) -> PinholeCamera:
+    """Return a camera that is moved along the world's axes [m]."""
+    return camera.with_pose(motion(np.array([0.0, 0.0, 0.0, *by])) @ camera.X_WC)
+
+
 def see(
     model: ArticulatedModel, body: RegistrationBody, camera: PinholeCamera, count: int, seed: int
 ) -> list[PosedFrame]:

@@ -5,20 +5,18 @@ from typing import Any
 
 import pytest
 
-from drake_pose.body import ArticulatedModel, load_model
+from drake_pose.body import ArticulatedModel
 from drake_pose.registration.posed_frames import PosedFrames
 from drake_pose.registration.recording import Recording
 from drake_pose.registration.register import RegistrationBody
 from tests.registration.arm_pictures import MIDDLE, PLACE, looking_at, see
 from tests.registration.episodes import LATE, PaintedEpisode, painted_episode
-from tests.search.arms import arm_urdf
+from tests.search.arms import arm_tree
 
 
 @pytest.fixture(scope="module")
 def model(tmp_path_factory: pytest.TempPathFactory) -> ArticulatedModel:
-    path = tmp_path_factory.mktemp("arm") / "arm.urdf"
-    path.write_text(arm_urdf())
-    return load_model(path, check=False)
+    return arm_tree(tmp_path_factory.mktemp("arm")).model
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,6 @@
 """Motions of a camera in drawn pictures of a wall before which things move."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import cv2
 import numpy as np
@@ -21,18 +21,22 @@ K = np.array([[FOCAL, 0.0, 159.5], [0.0, FOCAL, 119.5], [0.0, 0.0, 1.0]])
 STILL = np.eye(3)
 
 
+def patched(seed: int, size: tuple[int, int], cells: Sequence[int]) -> np.ndarray:
+    """Return a wall (H, W, 3) of random patches: so many a side, coarse ones first."""
+    rng, wall = np.random.default_rng(seed), np.zeros((*size[::-1], 3), np.float32)
+    for count, weight in zip(cells, (0.4, 0.4, 0.2), strict=True):
+        patches = rng.uniform(20, 235, (count, count, 3)).astype(np.float32)
+        wall += weight * cv2.resize(patches, size, interpolation=cv2.INTER_CUBIC)
+    return wall
+
+
 def told(turned: Callable[[int], np.ndarray], seed: int, *, lamp: bool = False) -> PictureMotion:
     """Return the motion found of a camera whose pose at picture k is turned by R (3, 3).
 
     A dark arm swings, a box as high as the picture crosses, a stack is taken away at picture 20,
     and, with a lamp, the light changes by a third and a shadow passes.
     """
-    rng = np.random.default_rng(seed)
-    wall = np.zeros((HEIGHT, WIDTH, 3), np.float32)
-    for cells, weight in ((5, 0.4), (20, 0.4), (60, 0.2)):
-        patches = rng.uniform(20, 235, (cells, cells, 3)).astype(np.float32)
-        wall += weight * cv2.resize(patches, (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC)
-    column = np.arange(WIDTH)
+    wall, column = patched(seed, (WIDTH, HEIGHT), (5, 20, 60)), np.arange(WIDTH)
 
     def read(k: int) -> np.ndarray:
         # A direction d of the first camera is R^T d in the turned one.
@@ -77,7 +81,9 @@ def test_nudges_are_found_at_their_picture_with_their_angle(seed: int) -> None:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_a_camera_that_stands_still_has_no_motion(seed: int) -> None:
-    assert told(lambda _: STILL, 10 + seed, lamp=seed % 2 == 1) == PictureMotion(())
+    motion = told(lambda _: STILL, 10 + seed, lamp=seed % 2 == 1)
+    assert motion == PictureMotion((), found_again=motion.found_again)
+    assert motion.found_again > 0.3  # 0.13 at most, where the camera rides on the robot.
 
 
 def test_two_nudges_of_which_the_second_undoes_the_first() -> None:
@@ -142,11 +148,7 @@ def test_steps_are_found_between_their_samples(levels, counts, noise, found) -> 
 
 def test_a_background_shift_has_four_parts_in_tracked_pixels() -> None:
     """The centre's motion, and rotation and growth times a picture's root mean square radius."""
-    rng = np.random.default_rng(7)
-    wall = np.zeros((480, 640, 3), np.float32)
-    for cells in (8, 30, 80):
-        patches = rng.uniform(20, 235, (cells, cells, 3)).astype(np.float32)
-        wall += cv2.resize(patches, (640, 480), interpolation=cv2.INTER_CUBIC) / 3.0
+    wall = patched(7, (640, 480), (8, 30, 80))
     camera = PinholeCamera("eye", 1280, 960, 1200.0, 1200.0, 639.5, 479.5, np.eye(4))
     wall = cv2.resize(wall, (1280, 960), interpolation=cv2.INTER_CUBIC)
     radius = np.hypot(640, 480) / np.sqrt(12.0)
@@ -162,8 +164,8 @@ def test_a_background_shift_has_four_parts_in_tracked_pixels() -> None:
     found = tracker.shifts(range(len(cases)))
     for shift, (u, v, angle, grow) in zip(found, cases, strict=True):
         expected = [0.5 * u, 0.5 * v, radius * angle, radius * (grow - 1.0)]
-        np.testing.assert_allclose(shift, expected, atol=0.12)
+        np.testing.assert_allclose(shift[:4], expected, atol=0.12)
     turn_of = tracker.rotation(np.array([3.0, -2.0, 5.0, 9.0]))
     np.testing.assert_allclose(turn_of, [2.0 / 600.0, 3.0 / 600.0, 5.0 / radius])
     blank = _Background(lambda _: np.full((960, 1280, 3), 90, np.uint8), 0, camera)
-    assert np.isnan(blank.shifts([0])).all()
+    assert np.isnan(blank.shifts([0])[:, :4]).all()

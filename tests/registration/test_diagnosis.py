@@ -12,7 +12,6 @@ from scipy.stats import f as fisher
 from drake_pose.body import ArticulatedModel
 from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import PinholeCamera
-from drake_pose.errors import MaskError
 from drake_pose.registration.diagnosis import (
     DIAGNOSIS,
     _Cause,
@@ -35,7 +34,7 @@ from drake_pose.registration.per_frame_fit import (
 from drake_pose.registration.posed_frames import MultiViewFrame
 from drake_pose.registration.register import RegistrationBody
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
-from tests.registration.arm_pictures import damaged
+from tests.registration.arm_pictures import damaged, shifted
 from tests.search.arms import arm_cameras
 
 COUNT = 8
@@ -53,12 +52,6 @@ def poses(body: RegistrationBody) -> np.ndarray:
     generator = np.random.default_rng(5)
     middle = np.radians([0.0, 50.0, 20.0, 60.0, 40.0])
     return middle + np.radians(25.0) * generator.uniform(-1.0, 1.0, (COUNT, 5))
-
-
-def moved(camera: PinholeCamera, by: Sequence[float]) -> PinholeCamera:
-    X_WC = camera.X_WC.copy()
-    X_WC[:3, 3] += by
-    return camera.with_pose(X_WC)
 
 
 @pytest.mark.parametrize(
@@ -116,14 +109,9 @@ def seen(model: ArticulatedModel, body: RegistrationBody, frames: Frames) -> lis
 
 
 def audit(
-    model: ArticulatedModel,
-    body: RegistrationBody,
-    poses: np.ndarray,
-    given: np.ndarray,
-    taken: Sequence[PinholeCamera],
-    told: Sequence[PinholeCamera] | None = None,
-    turns: int = 2,
-) -> Diagnosis:
+    model: ArticulatedModel, body: RegistrationBody, poses: np.ndarray, given: np.ndarray,
+    taken: Sequence[PinholeCamera], told: Sequence[PinholeCamera] | None = None, turns: int = 2,
+) -> Diagnosis:  # fmt: skip
     """Return the audit of pictures taken by some cameras, with given values and given cameras.
 
     turns: number of fits, each at the corrections that the one before it found.
@@ -196,14 +184,14 @@ class TestAuditFrames:
 
     def test_base_motion_in_one_frame(self, poses, cameras, with_wrong) -> None:
         """Both cameras see the motion, so it is not a camera's."""
-        away = [moved(camera, [0.0, -0.01, 0.0]) for camera in cameras]
+        away = [shifted(camera, 0.0, -0.01, 0.0) for camera in cameras]
         finding = with_wrong(poses[WRONG], away)
         assert finding.kind == "base"
         assert finding.shift == pytest.approx(0.01, abs=0.002)
 
     def test_camera_pose_error_in_all_frames(self, model, body, poses, cameras) -> None:
         for count, by in ((2, [0.0, 0.0, 0.01]), (1, [0.0, 0.01, 0.005])):
-            told = [*cameras[: count - 1], moved(cameras[count - 1], by)]
+            told = [*cameras[: count - 1], shifted(cameras[count - 1], *by)]
             found = audit(model, body, poses, poses, cameras[:count], told)
             assert found.outliers == ()
             assert [(one.kind, one.name) for one in found.common] == [("camera", told[-1].name)]
@@ -225,19 +213,6 @@ class TestAuditFrames:
         found = audit(model, body, poses, poses, cameras, aside)
         assert [one.kind for one in found.common] == ["center"]
         assert found.common[0].shift == pytest.approx(5.0, abs=0.7)
-
-
-def test_masks_of_wrong_size_and_empty_masks_are_refused(body, poses, cameras) -> None:
-    mask, given = np.ones((480, 640), bool), (body.kinematics, (body.medium, body.full))
-    frame, good, empty = (
-        MultiViewFrame(name, poses[0], {"left": one})
-        for name, one in (("0007", mask[:100]), ("0000", mask), ("0000", ~mask))
-    )
-    for frames, said in (([frame], r"'left', frame '0007'.*640 x 480"), ([empty], "no mask")):
-        with pytest.raises(MaskError, match=said):
-            PerFrameFit(*given, cameras[:1], frames)
-    with pytest.raises(MaskError, match="frame '0007'"):
-        PerFrameFit(*given, cameras[:1], [good]).fit(frame)
 
 
 def information(scale: float = 1.0, freedom: float = 50.0, seed: int = 3) -> _Information:
@@ -276,10 +251,7 @@ def test_statistic_and_p_value_are_those_of_known_directions() -> None:
     kept = turn[:, 1:]
     expected = (kept.T @ r) @ np.linalg.solve(kept.T @ Q @ kept, kept.T @ r)
     assert _statistic(r, Q, N) == (pytest.approx(expected), 3)
-    assert _statistic(r, Q) == (pytest.approx(r @ np.linalg.solve(Q, r)), 4)
     assert _statistic(r, Q, 0.1 * np.eye(4)) == (0.0, 0)
-    for T, rank, freedom in ((9.0, 3, 50.0), (30.0, 2, 7.0)):
-        assert _p_value(T, rank, freedom) == pytest.approx(fisher.sf(T / rank, rank, freedom))
     assert _p_value(5.0, 0, 9.0) == 1.0
     assert _p_value(-1e-9, 2, 9.0) == 1.0
 

@@ -12,7 +12,7 @@ from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError, UnknownNameError
 from drake_pose.fit.base_edges import joint_rotation
 from drake_pose.fit.covariance import round_parts
-from drake_pose.jobs.registration.words import likely_offset_warnings
+from drake_pose.jobs.registration.words import fit_of_inliers, likely_offset_warnings
 from drake_pose.registration.joint_offsets import (
     calibrate_joints,
     require_fit_kept,
@@ -128,7 +128,7 @@ def test_a_missing_offset_is_suspected_from_common_residuals(model, body, camera
     """The camera absorbs the offset, and its standard deviation does not show that."""
     frames = misread(see(model, body, camera, 6, 4), {"elbow_turn": np.radians(degrees)})
     found = CameraSearch(body).refine(camera, frames)
-    texts = likely_offset_warnings(body, found, frames)
+    texts = likely_offset_warnings(body, found.camera.name, fit_of_inliers(body, found, frames))
     assert len(texts) == (abs(degrees) > 1.0)
     word = "low" if degrees > 0.0 else "high"
     for text in texts:

@@ -53,7 +53,7 @@ from drake_pose.registration.standing_object import (
     require_rotation,
 )
 from drake_pose.silhouette.scoring import draw_mask
-from tests.registration.arm_pictures import MIDDLE, PLACE, errors, looking_at
+from tests.registration.arm_pictures import MIDDLE, PLACE, errors, looking_at, shifted
 from tests.search.arms import arm_cameras
 
 STEP = AnnealingStage(0.02, 0.02)
@@ -242,20 +242,14 @@ def test_overlaps_count_pixels_of_scaled_pictures(posed: PosedFrames) -> None:
                 shown = cv2.resize(mask, size, interpolation=cv2.INTER_AREA) > 0.5
                 counts = [np.count_nonzero(one) for one in (drawn, shown, drawn & shown)]
                 assert found[i, k].tolist() == counts
+                assert E_total(found[i, k]) == np.count_nonzero(drawn ^ shown) / shown.sum()
+                iou = np.count_nonzero(drawn & shown) / np.count_nonzero(drawn | shown)
+                assert intersection_over_union(found[i, k]) == iou
     ratios, inliers = np.array([0.9, 0.3]), np.array([True, False])
     first, second = frame_misfits(posed, X_CW, ratios, inliers)
     assert (first.frame, first.inlier_ratio, first.is_inlier) == (posed.frames[0].name, 0.9, True)
     assert not second.is_inlier
     assert first.E_total < 0.05 < 0.9 < first.iou
-
-
-def test_E_total_and_iou_match_pixel_counts() -> None:
-    rng = np.random.default_rng(4)
-    body, mask = rng.random((2, 30, 40)) < 0.4
-    found = np.array([np.count_nonzero(one) for one in (body, mask, body & mask)], float)
-    assert E_total(found) == np.count_nonzero(body ^ mask) / mask.sum()
-    iou = np.count_nonzero(body & mask) / np.count_nonzero(body | mask)
-    assert intersection_over_union(found) == iou
 
 
 SIDES = "0.2 0.12 0.08"
@@ -322,13 +316,6 @@ def test_target_covariance_matches_derivatives(make_target):
     thing, X_WT = make_target("box"), looking_at(PLACE, MIDDLE, 0.4).X_WC
     expected = by_differences(lambda x: thing.moved(X_WT, x))
     np.testing.assert_allclose(thing.pose_covariance(X_WT, SOME), expected, atol=1e-4)
-
-
-def test_masks_of_wrong_size_and_empty_masks_are_refused(body, posed):
-    for mask in (np.ones((10, 10), bool), np.zeros((480, 640), bool)):
-        frame = PosedFrame("0007", posed.frames[0].values, mask)
-        with pytest.raises(MaskError, match="camera 'eye', frame '0007'"):
-            PosedFrames(body.kinematics, body.medium, posed.camera, [frame])
 
 
 def test_a_target_must_be_detected_in_four_pictures_and_half_of_them() -> None:
@@ -466,9 +453,7 @@ def test_bundle_adjustment_corrects_camera_and_positions(body: RegistrationBody)
         X_WN = kinematics.poses(values)
         masks = {one.name: draw_mask(body.medium, one.X_CW @ X_WN, one) for one in cameras}
         frames.append(MultiViewFrame(f"{k}", values + rng.normal(0.0, 0.02, len(values)), masks))
-    X_WC = cameras[1].X_WC.copy()
-    X_WC[:3, 3] += [0.02, -0.02, 0.02]
-    given = [cameras[0], cameras[1].with_pose(X_WC)]
+    given = [cameras[0], shifted(cameras[1], 0.02, -0.02, 0.02)]
     nothing = np.zeros(len(kinematics.names), bool)
     (camera,), (covariance,), values, radius_scales = adjust_bundle(
         kinematics, body.medium, given, ("b",), frames, nothing
@@ -498,6 +483,22 @@ def per_frame(body, posed) -> tuple[PerFrameFit, list[MultiViewFrame]]:
     frames = [MultiViewFrame(one.name, one.values, {"eye": one.mask}) for one in posed.frames]
     surfaces = (body.medium, body.full)
     return PerFrameFit(body.kinematics, surfaces, [camera, flat], frames), frames
+
+
+def test_masks_of_wrong_size_and_empty_masks_are_refused(body, posed, per_frame):
+    (fit, (frame, *_)), surfaces = per_frame, (body.medium, body.full)
+    for mask, said in (
+        (np.zeros((480, 640), bool), "no mask"),
+        (np.ones((9, 9), bool), "640 x 480"),
+    ):
+        one = replace(posed.frames[0], name="0007", mask=mask)
+        with pytest.raises(MaskError, match="camera 'eye', frame '0007'"):
+            PosedFrames(body.kinematics, body.medium, posed.camera, [one])
+        several = replace(frame, name="0007", masks={"eye": mask})
+        with pytest.raises(MaskError, match=said):
+            PerFrameFit(body.kinematics, surfaces, fit.cameras, [several])
+    with pytest.raises(MaskError, match=r"camera 'eye', frame '0007'.*640 x 480"):
+        fit.fit(several)
 
 
 @pytest.mark.parametrize("wider", [-2, 1, 2])

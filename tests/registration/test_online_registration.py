@@ -20,7 +20,6 @@ from drake_pose.registration.online_registration import (
 )
 from drake_pose.registration.posed_frames import PosedFrame
 from drake_pose.registration.register import FrameMisfit, RegisteredCamera, RegistrationBody
-from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.registration.test_register import looking_at
 
 NOT_REGISTERED, REGISTERED, CONTRADICTED = CameraStatus
@@ -145,9 +144,7 @@ class TestKeyframes:
     @pytest.mark.parametrize(
         ("doubt", "value"), [("alternatives", 1), ("p_value", 0.02), ("mirrored", 0.5)]
     )
-    def test_an_ambiguous_or_unproven_camera_is_not_registered(
-        self, online, search, doubt, value
-    ) -> None:
+    def test_an_ambiguous_or_unproven_camera_is_not_registered(self, online, search, doubt, value):
         usual = getattr(search, doubt)
         setattr(search, doubt, value)
         state, statuses = follow(online, OnlineState(), [frame("here", t) for t in TURNS[:5]])
@@ -237,34 +234,6 @@ def bumped(camera: PinholeCamera, degrees: float, metres: float) -> PinholeCamer
     X_WC[:3, :3] = Rotation.from_rotvec(np.radians(degrees) * AXIS).as_matrix() @ X_WC[:3, :3]
     X_WC[:3, 3] += metres * AXIS[[1, 2, 0]]
     return camera.with_pose(X_WC)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("degrees", "metres"), [(0.4, 0.006), (6.0, 0.08)])
-def test_a_bumped_camera_is_registered_again(model, body, degrees, metres):
-    """With Drake's masks of a moving arm, and small and large bumps."""
-    rng, kinematics = np.random.default_rng(11), body.kinematics
-    before = camera_at(1.6)
-    cameras = [before] * 10 + [bumped(before, degrees, metres)] * 7
-    renderers = {id(camera): LabelRenderer(model, camera) for camera in cameras}
-    online = OnlineRegistration(body, before.with_pose(np.eye(4)))
-    state, moves = OnlineState(), []
-    for k, camera in enumerate(cameras):
-        values = rng.uniform(kinematics.lower, kinematics.upper)
-        q, X_WB = body.tree.positions_from(kinematics.split(values))
-        mask = renderers[id(camera)].mask(q, X_WB)
-        state = online.next(state, PosedFrame(f"{k:04d}", values, mask))
-        moves.append(state.moves)
-        if k in (9, len(cameras) - 1):
-            assert online.status(state) == REGISTERED
-            assert state.registered is not None
-            off = pose_difference(state.registered.camera.X_WC, camera.X_WC)
-            assert np.linalg.norm(off[:3]) < np.radians(0.1)
-            assert np.linalg.norm(off[3:]) < 2e-3
-            # 99.9 % of a chi-square distribution with six degrees of freedom.
-            assert off @ np.linalg.solve(state.registered.covariance, off) < 22.5
-    assert moves[9] == 0
-    assert moves[-1] == 1
 
 
 def test_pose_difference_is_along_the_worlds_axes() -> None:

@@ -8,7 +8,7 @@ import pytest
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from drake_pose.camera.picture_files import TimedVideo
+from drake_pose.camera.picture_files import Video
 from drake_pose.errors import RegistrationError
 from drake_pose.fit.background import COLOURS, KnownBackground, foreground_picture
 from drake_pose.fit.explain_kernel import Explained
@@ -436,7 +436,7 @@ def test_camera_is_found_without_initial_guess_within_its_deviations(episode, re
 def test_camera_is_found_in_compressed_pictures(episode, recording, tmp_path):
     path = tmp_path / "camera.mp4"
     write_pictures(path, episode.pictures, episode.times, "libx264", crf="33")
-    found = register_pictures(episode.body, episode.camera, recording(read=TimedVideo(path).read))
+    found = register_pictures(episode.body, episode.camera, recording(read=Video(path).read))
     error = pose_error(found.found.camera.X_WC, episode.camera.X_WC)
     assert (np.abs(error) < 3.0 * np.sqrt(np.diag(found.found.covariance))).all()
     assert np.linalg.norm(error[3:]) < 0.025

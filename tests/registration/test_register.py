@@ -8,11 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from drake_pose.errors import RegistrationError
 from drake_pose.registration.posed_frames import PosedFrame
-from drake_pose.registration.register import (
-    CameraSearch,
-    RegistrationBody,
-    uniform_rotations,
-)
+from drake_pose.registration.register import CameraSearch, RegistrationBody, uniform_rotations
 from tests.registration.arm_pictures import MIDDLE, PLACE, errors, looking_at, see
 
 

@@ -16,10 +16,7 @@ from drake_pose.registration import hand_eye, track_registration
 from drake_pose.registration.hand_eye import TrackFit, motion
 from drake_pose.registration.picture_matches import Matches
 from drake_pose.registration.recording import Recording
-from drake_pose.registration.track_registration import (
-    TrackRegistration,
-    register_tracks,
-)
+from drake_pose.registration.track_registration import TrackRegistration, register_tracks
 from tests.registration.test_hand_eye_tracks import (
     CAMERA,
     TIMES,
@@ -65,7 +62,9 @@ class Scene:
         self.settings(least=25)
         monkeypatch.setattr(track_registration, "EpipolarSearch", QuickSearch)
         kinematics = SimpleNamespace(names=JOINTS, is_angle=np.ones(3, bool))
-        self.body = SimpleNamespace(kinematics=kinematics)
+        nodes = [SimpleNamespace(name=name) for name in ("base", "arm")]
+        tree = SimpleNamespace(nodes=nodes)
+        self.body = SimpleNamespace(kinematics=kinematics, tree=tree)
         self.recording = Recording(
             tuple("abcdefghijklmn"), lambda _: np.zeros((14, 3)), lambda k: np.full((1, 1, 3), k),
             TIMES,
@@ -86,7 +85,7 @@ class Scene:
         self,
         poses: Callable[[Array], Array] = link_poses,
         pairs: int | None = None,
-        elsewhere: tuple[float, str] = (0.0, ""),
+        elsewhere: tuple[float, int] = (0.0, 0),
         **given: Any,
     ) -> TrackRegistration:
         matches = all_matches(self.seen)
@@ -98,7 +97,7 @@ class Scene:
             "choose_pictures": ([*range(0, 14, 2)], [*range(1, 14, 2)]),
             "recorded_link_poses": poses,
             "match_pictures": (matches, self.seen),
-            "explaining_link": elsewhere,
+            "explaining_links": [elsewhere],
         }.items():
             self._patch.setattr(track_registration, name, lambda *_, value=value, **__: value)
         camera, recording = given.pop("camera", CAMERA), given.pop("recording", self.recording)
@@ -138,6 +137,8 @@ def test_focal_length_and_offsets_are_found_where_they_are_asked_for(scene: Scen
     assert found.found.camera.focal_x == pytest.approx(500.0, abs=5.0)
     assert found.found.camera.focal_y == pytest.approx(510.0, abs=5.0)
     assert 0.0 < found.focal_deviation < 0.01
+    off = np.log(found.found.camera.focal_x / 500.0)
+    assert off == pytest.approx(0.0, abs=4.0 * found.focal_deviation)
     middle, last = found.offsets
     assert (middle.name, last.name, found.likely) == ("middle", "last", ())
     assert middle.low < 0.12 < middle.high
@@ -171,7 +172,7 @@ def wrong_hand(_: Array) -> Array:
         ({"poses": lambda _: hand(TIMES, (0.0, 0.0, 0.6))}, "and by 0.0 about others.* position"),
         ({"poses": lambda _: still(hand(TIMES))}, "moves by 0 mm .* scale"),
         ({"poses": wrong_hand}, "on link 'hand'.* --target"),
-        ({"poses": wrong_hand, "elsewhere": (0.9, "arm")}, "'arm' .* 90%.*--on arm"),
+        ({"poses": wrong_hand, "elsewhere": (0.9, 1)}, "'arm' .* 90%.*--on arm"),
     ],
 )
 def test_scenes_that_cannot_determine_a_pose_are_refused(scene: Scene, given, told) -> None:

@@ -5,7 +5,6 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 import trimesh
-from scipy.spatial.transform import Rotation
 
 from drake_pose.body import load_model
 from drake_pose.camera.models import ParallelCamera, PinholeCamera
@@ -14,6 +13,7 @@ from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.scoring import draw_mask
 from tests.body.models import joint, link, urdf, write
 from tests.silhouette.agreement import MAX_DIFFERENCE, measure_agreement
+from tests.silhouette.shapes import random_pose
 
 SHAPES = {
     "box": '<box size="0.3 0.2 0.5"/>',
@@ -40,11 +40,8 @@ def model_of(folder, shapes):
     parts, parent = [], "world"
     for i, shape in enumerate(shapes):
         name, axis = f"link_{i}", ("1 0 0", "0 1 0", "0 0.6 0.8")[i % 3]
-        visual = (
-            '<visual><origin xyz="0 0 0.25" rpy="0.3 0 0.2"/>'
-            f"<geometry>{SHAPES[shape]}</geometry></visual>"
-        )
-        parts.append(link(name, visual))
+        solid = f'<origin xyz="0 0 0.25" rpy="0.3 0 0.2"/><geometry>{SHAPES[shape]}</geometry>'
+        parts.append(link(name, f"<visual>{solid}</visual>"))
         at = {"origin": 'xyz="0 0 0.4"', "limits": 'lower="-2" upper="2"'}
         parts.append(joint(f"{name}_joint", "revolute", parent, name, axis=axis, **at))
         parent = name
@@ -54,20 +51,18 @@ def model_of(folder, shapes):
 
 def looking_at_origin(rng, distance):
     """A pose X_WC with the origin near the image's middle."""
-    X_WC = np.eye(4)
-    X_WC[:3, :3] = Rotation.random(random_state=rng).as_matrix()
+    X_WC = random_pose(rng, (0.0, 0.0, 0.0))
     X_WC[:3, 3] = -distance * X_WC[:3, 2] + rng.uniform(-0.1, 0.1, 3)
     return X_WC
 
 
 def cameras(rng):
     """A parallel camera, a pinhole camera, and one whose near plane cuts the model."""
+    first, second, third = (looking_at_origin(rng, distance) for distance in (3.0, 3.0, 0.6))
     return [
-        ParallelCamera("parallel", 500, 400, 180.0, 230.3, 210.7, looking_at_origin(rng, 3.0)),
-        PinholeCamera("far", 480, 360, 400.0, 410.0, 250.2, 170.6, looking_at_origin(rng, 3.0)),
-        PinholeCamera(
-            "close", 480, 360, 200.0, 210.0, 250.2, 170.6, looking_at_origin(rng, 0.6), near=0.4
-        ),
+        ParallelCamera("parallel", 500, 400, 180.0, 230.3, 210.7, first),
+        PinholeCamera("far", 480, 360, 400.0, 410.0, 250.2, 170.6, second),
+        PinholeCamera("close", 480, 360, 200.0, 210.0, 250.2, 170.6, third, near=0.4),
     ]
 
 
@@ -88,22 +83,19 @@ def test_labels_are_those_of_links(tmp_path):
     renderer = LabelRenderer(model, camera)
     q = np.array([0.4, -0.7])
     segments = renderer.segments(q)
-    names = {renderer.link_names[label] for label in np.unique(segments) if label >= 0}
-    assert names == {"link_0", "link_1"}
+    seen = {renderer.link_names[label]: label for label in np.unique(segments) if label >= 0}
+    assert {*seen} == {"link_0", "link_1"}
     np.testing.assert_array_equal(segments >= 0, renderer.mask(q))
     poses = renderer.link_poses(q)
-    for label, name in renderer.link_names.items():
-        if name in names:
-            outline = outline_from_mesh(model.link_meshes[name])
-            alone = draw_mask([outline], (camera.X_CW @ poses[label])[None], camera)
-            outside = np.count_nonzero((segments == label) & ~alone)
-            assert outside <= max(2, 0.002 * alone.sum())
+    for name, label in seen.items():
+        outline = outline_from_mesh(model.link_meshes[name])
+        alone = draw_mask([outline], (camera.X_CW @ poses[label])[None], camera)
+        assert np.count_nonzero((segments == label) & ~alone) <= max(2, 0.002 * alone.sum())
 
 
 def test_wrong_positions_and_threads_are_refused(tmp_path):
-    renderer = LabelRenderer(
-        model_of(tmp_path, ["box"]), ParallelCamera("c", 40, 30, 9.0, 20.0, 15.0, np.eye(4))
-    )
+    camera = ParallelCamera("c", 40, 30, 9.0, 20.0, 15.0, np.eye(4))
+    renderer = LabelRenderer(model_of(tmp_path, ["box"]), camera)
     for q in (np.zeros(2), np.array([np.nan])):
         with pytest.raises(ValueError, match=r"q must be \(1,\)"):
             renderer.mask(q)

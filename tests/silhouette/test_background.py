@@ -73,14 +73,6 @@ def test_small_patches_are_dropped_beside_a_ring():
     np.testing.assert_array_equal(background.with_noise(2.0).deviation, 2.0)
 
 
-def test_pictures_of_different_sizes_are_refused():
-    with pytest.raises(SettingsError):
-        learn_background([])
-    background = learn_background([np.zeros((4, 5, 3), np.uint8)])
-    with pytest.raises(SettingsError):
-        person_region(np.zeros((5, 4, 3), np.uint8), background)
-
-
 def test_moving_object_is_not_in_the_median_background():
     rng, pictures = np.random.default_rng(2), []
     room = texture(np.random.default_rng(3))
@@ -91,8 +83,13 @@ def test_moving_object_is_not_in_the_median_background():
     background = background_of_recording(pictures)
     np.testing.assert_allclose(background.mean, room, atol=6.0)
     np.testing.assert_allclose(background.deviation, 3.0, atol=0.1)
-    with pytest.raises(SettingsError, match="three or more"):
-        background_of_recording(pictures[:2])
+    for refused, message in (
+        (lambda: background_of_recording(pictures[:2]), "three or more"),
+        (lambda: learn_background([]), ""),
+        (lambda: person_region(pictures[0][:-1], background), ""),
+    ):
+        with pytest.raises(SettingsError, match=message):
+            refused()
 
 
 @pytest.mark.parametrize("width", [480, 960])
@@ -106,6 +103,7 @@ def test_regions_of_large_pictures_have_sharp_edges(width):
     best = max(find_regions(picture, 6), key=lambda one: intersection_over_union(one, disc))
     assert intersection_over_union(best, disc) > 0.98
     assert len(find_regions(picture, 2)) == 2
+    assert find_regions(np.full((60, 80, 3), 100, np.uint8), 12) == []
 
 
 def drawn(at_border, width):
@@ -113,9 +111,8 @@ def drawn(at_border, width):
     rng, height = np.random.default_rng(0), 3 * width // 4
     picture = np.full((height, width, 3), (120, 90, 60), np.uint8)
     cv2.ellipse(picture, (width // 4, height // 2), (90, 60), 20.0, 0.0, 220.0, (60, 90, 160), 20)
-    turned = cv2.boxPoints(
-        ((0.7 * width, (0.05 if at_border else 0.5) * height), (150.0, 110.0), 25.0)
-    )
+    middle = 0.7 * width, (0.05 if at_border else 0.5) * height
+    turned = cv2.boxPoints((middle, (150.0, 110.0), 25.0))
     mask = cv2.fillPoly(np.zeros((height, width), np.uint8), [turned.astype(np.int32)], 1) > 0
     picture[mask] = 225
     u, v = np.meshgrid(np.arange(width), np.arange(height))
@@ -133,7 +130,3 @@ def test_patterned_object_is_one_region(at_border, width):
         regions = find_regions(shown, 12)
         assert max(intersection_over_union(one, mask) for one in regions) > 0.97
         assert all(one.shape == mask.shape for one in regions)
-
-
-def test_uniform_picture_has_no_regions():
-    assert find_regions(np.full((60, 80, 3), 100, np.uint8), 12) == []

@@ -8,33 +8,24 @@ from scipy.spatial.transform import Rotation
 
 from drake_pose.body import TriangleMesh
 from drake_pose.camera.models import ParallelCamera, PinholeCamera
-from drake_pose.silhouette.bit_kernel import (
-    draw_bits,
-    draw_discs,
-    make_bit_view,
-    prune_by_balls,
-)
+from drake_pose.silhouette.bit_kernel import draw_bits, draw_discs, make_bit_view, prune_by_balls
 from drake_pose.silhouette.contour_points import divide_outline
 from drake_pose.silhouette.outline import outline_from_mesh
 from drake_pose.silhouette.scoring import VisualHull, draw_mask
+from tests.silhouette.shapes import soup
 
 _POSES = 120
 
 
-def crooked_surface(seed, triangles=60):
+def crooked_surface(seed):
     """Random triangles: open, intersecting, with edges of one and of several triangles."""
-    generator = np.random.default_rng(seed)
-    vertices = generator.uniform(-0.12, 0.12, (triangles // 2, 3))
-    return outline_from_mesh(
-        TriangleMesh(vertices, generator.integers(0, len(vertices), (triangles, 3)))
-    )
+    return outline_from_mesh(soup(np.random.default_rng(seed), 30, 60, 0.07))
 
 
-def picture_cameras():
-    return [
-        ParallelCamera("parallel", 90, 70, 180.0, 40.3, 33.7, np.eye(4)),
-        PinholeCamera("pinhole", 90, 70, 150.0, 170.0, 40.3, 33.7, np.eye(4)),
-    ]
+CAMERAS = [
+    ParallelCamera("parallel", 90, 70, 180.0, 40.3, 33.7, np.eye(4)),
+    PinholeCamera("pinhole", 90, 70, 150.0, 170.0, 40.3, 33.7, np.eye(4)),
+]
 
 
 def random_poses(seed, depth=1.0):
@@ -66,11 +57,10 @@ def read_bits(view, numbers, run, words):
     return mask
 
 
-def pairs():
-    return np.column_stack([np.zeros(_POSES), np.arange(_POSES)]).astype(np.int32)
+PAIRS = np.column_stack([np.zeros(_POSES), np.arange(_POSES)]).astype(np.int32)
 
 
-@pytest.mark.parametrize("camera", picture_cameras(), ids=lambda camera: camera.name)
+@pytest.mark.parametrize("camera", CAMERAS, ids=lambda camera: camera.name)
 @pytest.mark.parametrize("spread", [0.0, 0.25])
 def test_bits_equal_the_span_kernels_pixels(camera, spread):
     outline, mask = crooked_surface(1), random_mask(2)
@@ -78,7 +68,7 @@ def test_bits_equal_the_span_kernels_pixels(camera, spread):
     # At some poses the cells are invalid, and the near plane cuts some.
     X_WN = np.concatenate([random_poses(3)[: _POSES // 2], random_poses(4, 0.2)[_POSES // 2 :]])
     celled = divide_outline(outline, spread)
-    kept, areas, runs, words = draw_bits(celled, view, np.eye(4)[None], X_WN, pairs(), np.inf)
+    kept, areas, runs, words = draw_bits(celled, view, np.eye(4)[None], X_WN, PAIRS, np.inf)
     assert kept.all()
     band = np.zeros(mask.shape, dtype=bool)
     for i, X in enumerate(X_WN):
@@ -95,24 +85,22 @@ def test_bits_equal_the_span_kernels_pixels(camera, spread):
 
 
 def test_poses_beyond_the_limit_are_skipped():
-    camera, outline, mask = picture_cameras()[0], crooked_surface(5), random_mask(6)
+    camera, outline, mask = CAMERAS[0], crooked_surface(5), random_mask(6)
     view = make_bit_view(mask, camera.kernel_parameters(), camera.X_CW, 0)
     X_WN = random_poses(7)
     masks = [draw_mask([outline], X[None], camera) for X in X_WN]
     outside = np.array([int((drawn & ~mask).sum()) for drawn in masks])
     limit = float(np.median(outside))
-    kept = draw_bits(divide_outline(outline), view, np.eye(4)[None], X_WN, pairs(), limit)[0]
+    kept = draw_bits(divide_outline(outline), view, np.eye(4)[None], X_WN, PAIRS, limit)[0]
     assert np.array_equal(kept, outside <= limit)
 
 
-def thick_surface():
-    """An ellipsoid."""
-    ball = trimesh.creation.icosphere(3)
-    return outline_from_mesh(TriangleMesh(ball.vertices * [0.05, 0.08, 0.2], ball.faces))
+BALL = trimesh.creation.icosphere(3)
+ELLIPSOID = outline_from_mesh(TriangleMesh(BALL.vertices * [0.05, 0.08, 0.2], BALL.faces))
 
 
 def test_balls_are_inside_and_reach_the_ends():
-    balls = VisualHull(thick_surface()).spread_balls(8)
+    balls = VisualHull(ELLIPSOID).spread_balls(8)
     # Points on each ball in all directions are inside the ellipsoid.
     directions = Rotation.random(300, random_state=1).as_matrix()[:, 0]
     points = balls[:, None, :3] + balls[:, None, 3:] * directions
@@ -136,8 +124,8 @@ def test_hull_of_a_ball_is_the_ball():
 
 
 def test_each_ball_reaches_farthest_beyond_those_before_it():
-    hull = VisualHull(thick_surface())
-    few, more = hull.spread_balls(4, points_per_side=9), hull.spread_balls(9, points_per_side=9)
+    hull = VisualHull(ELLIPSOID)
+    few, more = (hull.spread_balls(count, points_per_side=9) for count in (4, 9))
     np.testing.assert_array_equal(few, more[:4])
     np.testing.assert_allclose(more[:, 3], hull.radii(more[:, :3]))
     steps = 0.2 * np.linspace(-1.0, 1.0, 9)
@@ -155,32 +143,31 @@ def test_each_ball_reaches_farthest_beyond_those_before_it():
 
 
 def test_empty_surface_has_no_balls():
-    empty = outline_from_mesh(TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int32)))
-    assert VisualHull(empty).spread_balls(5).shape == (0, 4)
-    assert VisualHull(empty).radii(np.zeros((2, 3))).tolist() == [0.0, 0.0]
+    empty = VisualHull(outline_from_mesh(TriangleMesh.empty()))
+    assert empty.spread_balls(5).shape == (0, 4)
+    assert empty.radii(np.zeros((2, 3))).tolist() == [0.0, 0.0]
 
 
-@pytest.mark.parametrize("camera", picture_cameras(), ids=lambda camera: camera.name)
+@pytest.mark.parametrize("camera", CAMERAS, ids=lambda camera: camera.name)
 @pytest.mark.parametrize("limit", [0.0, 40.0])
 def test_pruning_keeps_every_pose_within_the_limit(camera, limit):
-    outline = thick_surface()
-    mask = np.zeros((70, 90), dtype=bool)
+    outline, mask = ELLIPSOID, np.zeros((70, 90), dtype=bool)
     mask[10:60, 15:80] = True
     mask[30:34, 40:44] = False
     view = make_bit_view(mask, camera.kernel_parameters(), camera.X_CW, 0)
     X_WN = random_poses(8)
     balls = VisualHull(outline).spread_balls(8)
     p_PB = balls[:, :3] @ np.swapaxes(X_WN[:, :3, :3], 1, 2) + X_WN[:, None, :3, 3]
-    left = prune_by_balls(view, np.eye(4)[None], p_PB, balls[:, 3].copy(), pairs(), limit)
+    left = prune_by_balls(view, np.eye(4)[None], p_PB, balls[:, 3].copy(), PAIRS, limit)
     masks = [draw_mask([outline], X[None], camera) for X in X_WN]
     outside = np.array([int((drawn & ~mask).sum()) for drawn in masks])
     assert left[outside <= limit].all()
     assert not left[outside > 400].all()
 
 
-@pytest.mark.parametrize("camera", picture_cameras(), ids=lambda camera: camera.name)
+@pytest.mark.parametrize("camera", CAMERAS, ids=lambda camera: camera.name)
 def test_discs_contain_the_surface(camera):
-    outline, mask = thick_surface(), random_mask(9)
+    outline, mask = ELLIPSOID, random_mask(9)
     view = make_bit_view(mask, camera.kernel_parameters(), camera.X_CW, 0)
     X_WN = random_poses(10)
     runs, words = draw_discs(view, X_WN, outline.ball[:3], float(outline.ball[3]))

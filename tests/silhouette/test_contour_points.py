@@ -107,10 +107,8 @@ def test_occluded_surfaces_have_no_points():
 
 
 def test_scaled_pose_equals_scaled_body_in_a_parallel_camera():
-    camera = CAMERAS[0]
-    X = random_pose(np.random.default_rng(2), (0.0, 0.0, 0.0))
-    scaled = X.copy()
-    scaled[:3, :3] *= 1.3
+    camera, X = CAMERAS[0], random_pose(np.random.default_rng(2), (0.0, 0.0, 0.0))
+    scaled = X * np.append(3 * [1.3], 1.0)
     small = find_contour_points((outline_from_mesh(box(0.5)),), scaled[None], camera)
     large = find_contour_points((outline_from_mesh(box(0.65)),), X[None], camera)
     assert np.allclose(small.uv, large.uv)
@@ -118,11 +116,8 @@ def test_scaled_pose_equals_scaled_body_in_a_parallel_camera():
 
 
 def test_body_outside_the_image_has_no_points():
-    X = np.eye(4)
-    X[0, 3] = 50.0
-    outline = outline_from_mesh(box(0.5))
-    assert len(find_contour_points((outline,), X[None], CAMERAS[0]).uv) == 0
-    behind = np.eye(4)
-    behind[2, 3] = -2.0
-    assert len(find_contour_points((outline,), behind[None], CAMERAS[1]).uv) == 0
-    assert len(find_contour_points((), np.zeros((0, 4, 4)), CAMERAS[0]).uv) == 0
+    beside, behind = np.eye(4)[None], np.eye(4)[None]
+    beside[0, 0, 3], behind[0, 2, 3] = 50.0, -2.0
+    one = (outline_from_mesh(box(0.5)),)
+    for outlines, X, k in ((one, beside, 0), (one, behind, 1), ((), np.zeros((0, 4, 4)), 0)):
+        assert len(find_contour_points(outlines, X, CAMERAS[k]).uv) == 0

@@ -50,9 +50,7 @@ def pose(model, q, camera):
 def test_masks_match_brute_force(tmp_path):
     model = load_limb(tmp_path)
     tree = model.pose_tree()
-    surfaces = TreeSurfaces(tree)
-    rng = np.random.default_rng(0)
-    gained = 0
+    surfaces, rng, gained = TreeSurfaces(tree), np.random.default_rng(0), 0
     # The near plane of the last camera cuts a band.
     X_WC = looking_along([0, 1, 0.1], 0.06)
     near = PinholeCamera("near", SIDE, SIDE, 60.0, 60.0, 80.2, 79.7, X_WC, near=0.02)
@@ -69,9 +67,8 @@ def test_masks_match_brute_force(tmp_path):
 
 
 def test_batch_scores_equal_single_scores(tmp_path):
-    model = load_limb(tmp_path)
+    model, rng = load_limb(tmp_path), np.random.default_rng(1)
     surfaces = TreeSurfaces(model.pose_tree())
-    rng = np.random.default_rng(1)
     for camera in cameras(rng):
         sets = rng.random((2, SIDE, SIDE)) < 0.4
         prefixes = np.array([prefix_sums(mask) for mask in sets])
@@ -86,9 +83,8 @@ def test_batch_scores_equal_single_scores(tmp_path):
         found = score_bodies(whole, X_CN, camera, prefixes, bands)
         for areas, (values, X) in zip(found, posed, strict=True):
             outlines = surfaces.at(values)
-            np.testing.assert_array_equal(
-                areas, score_bodies(outlines, X[None], camera, prefixes)[0]
-            )
+            single = score_bodies(outlines, X[None], camera, prefixes)[0]
+            np.testing.assert_array_equal(areas, single)
             mask = draw_mask(outlines, X, camera)
             assert list(areas) == [mask.sum(), *((mask & s).sum() for s in sets)]
             left, prefix = sets[0].copy(), prefixes[0].copy()
@@ -98,10 +94,8 @@ def test_batch_scores_equal_single_scores(tmp_path):
 
 def test_bits_have_the_band_at_their_sample(tmp_path):
     """Bit masks equal the kernel's masks at each of many samples of a node."""
-    model = load_limb(tmp_path)
-    tree = model.pose_tree()
-    surfaces = TreeSurfaces(tree)
-    rng = np.random.default_rng(2)
+    tree = load_limb(tmp_path).pose_tree()
+    surfaces, rng = TreeSurfaces(tree), np.random.default_rng(2)
     skin = tree.nodes[2].skin
     values = rng.uniform(-2.0, 2.0, (12, 3))
     X_PN = tree.relative_transforms(2, values)
@@ -157,9 +151,8 @@ def test_each_thread_deforms_its_own_copy(tmp_path):
 
 
 def test_bands_of_wrong_shape_are_refused():
-    tetrahedron = TriangleMesh(
-        np.vstack([np.zeros(3), np.eye(3)]), np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
-    )
+    faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+    tetrahedron = TriangleMesh(np.vstack([np.zeros(3), np.eye(3)]), faces)
     nothing = outline_from_mesh(TriangleMesh.empty())
     bending = BendingOutline(nothing, tetrahedron)
     camera = cameras(np.random.default_rng(4))[0]

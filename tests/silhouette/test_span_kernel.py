@@ -25,10 +25,7 @@ CAMERAS: list[Camera] = [
     PinholeCamera("pinhole", 90, 70, 100.0, 110.0, 44.3, 33.1, np.eye(4), near=0.1),
     PinholeCamera("off_centre", 61, 83, 150.0, 140.0, -20.3, 91.7, np.eye(4), near=0.1),
 ]
-
-
-def name_of(camera):
-    return camera.name
+each_camera = pytest.mark.parametrize("camera", CAMERAS, ids=lambda camera: camera.name)
 
 
 def require_exact(mesh, X_CN, camera):
@@ -38,49 +35,35 @@ def require_exact(mesh, X_CN, camera):
     return mask
 
 
-@pytest.mark.parametrize("camera", CAMERAS, ids=name_of)
+@each_camera
 def test_masks_of_triangle_soups_are_exact(camera):
+    """Before the camera, cut by its near plane, and with many crossings of a row."""
     rng = np.random.default_rng(1)
-    covered = 0
-    for _ in range(40):
-        mesh = soup(rng, 12, int(rng.integers(1, 30)), 0.4)
-        covered += require_exact(mesh, random_pose(rng, (0.1, -0.1, 3.0)), camera).sum()
-    assert covered > 1000
-
-
-@pytest.mark.parametrize("count", [60, 400])
-def test_rows_with_many_crossings_are_exact(count):
-    rng = np.random.default_rng(5)
-    corners = 0.03 * rng.normal(size=(count, 3, 3)) + 0.4 * rng.normal(size=(count, 1, 3))
-    small = TriangleMesh(
-        corners.reshape(-1, 3), np.arange(3 * count, dtype=np.int32).reshape(-1, 3)
-    )
-    for camera in CAMERAS[:2]:
+    for low, high in ((3.0, 3.0), (-0.6, 0.8)):
+        covered = partly = 0
+        for _ in range(60):
+            mesh = soup(rng, 12, int(rng.integers(1, 30)), 0.4)
+            X_CN = random_pose(rng, (0.1, -0.1, rng.uniform(low, high)))
+            mask = require_exact(mesh, X_CN, camera)
+            covered += int(mask.sum())
+            partly += 0 < mask.sum() < mask.size
+        assert (covered > 1000) & (partly > 15)
+    for count in (60, 400):
+        corners = 0.03 * rng.normal(size=(count, 3, 3)) + 0.4 * rng.normal(size=(count, 1, 3))
+        indices = np.arange(3 * count, dtype=np.int32).reshape(-1, 3)
+        small = TriangleMesh(corners.reshape(-1, 3), indices)
         require_exact(small, random_pose(rng, (0.0, 0.0, 3.0)), camera)
 
 
-def test_near_plane_clipping_is_exact():
-    rng = np.random.default_rng(2)
-    covered = 0
-    for camera in CAMERAS[1:]:
-        for _ in range(60):
-            mesh = soup(rng, 12, int(rng.integers(1, 20)), 0.4)
-            X_CN = random_pose(rng, (0.0, 0.0, rng.uniform(-0.6, 0.8)))
-            mask = require_exact(mesh, X_CN, camera)
-            covered += 0 < mask.sum() < mask.size
-    assert covered > 30
-
-
-@pytest.mark.parametrize("camera", CAMERAS, ids=name_of)
+@each_camera
 def test_scores_equal_sums_over_masks(camera):
     rng = np.random.default_rng(4)
     size = (camera.height, camera.width)
     sets = rng.random((3, *size)) < np.array([0.1, 0.5, 0.9])[:, None, None]
     prefixes = np.array([prefix_sums(region) for region in sets])
     outlines = [outline_from_mesh(soup(rng, 20, 25, 0.3)) for _ in range(4)]
-    X_CN = np.array(
-        [[random_pose(rng, (*rng.uniform(-0.5, 0.5, 2), 2.0)) for _ in outlines] for _ in range(15)]
-    )
+    poses = [random_pose(rng, (*rng.uniform(-0.5, 0.5, 2), 2.0)) for _ in range(60)]
+    X_CN = np.reshape(poses, (15, 4, 4, 4))
     whole = score_bodies(outlines, X_CN, camera, prefixes)
     single = score_bodies([outlines[1]], X_CN[:, 1:2], camera, prefixes)
     assert whole.dtype == single.dtype == np.int64
@@ -89,10 +72,8 @@ def test_scores_equal_sums_over_masks(camera):
         union = np.any(parts, axis=0)
         np.testing.assert_array_equal(draw_mask(outlines, X_CN[n], camera), union)
         assert whole[n].tolist() == [union.sum(), *((union & region).sum() for region in sets)]
-        assert single[n].tolist() == [
-            parts[1].sum(),
-            *((parts[1] & region).sum() for region in sets),
-        ]
+        alone = parts[1]
+        assert single[n].tolist() == [alone.sum(), *((alone & region).sum() for region in sets)]
 
 
 @pytest.mark.parametrize("far", [1e3, 1e9, 1e300])
@@ -107,17 +88,13 @@ def test_surfaces_far_outside_the_image_have_no_area(far):
     assert areas[4, 0] == areas[4, 1] > 3000
 
 
-def test_surface_larger_than_the_image_fills_it():
+def test_large_surfaces_fill_the_image_and_empty_ones_have_no_area():
     X_CN = np.eye(4)
     X_CN[2, 3] = 600.0
     for camera in CAMERAS:
         assert draw_mask([outline_from_mesh(box(1000.0))], X_CN[None], camera).all()
-
-
-def test_empty_surfaces_have_no_area():
-    empty = outline_from_mesh(TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int32)))
-    cube = outline_from_mesh(box(0.5))
-    camera = CAMERAS[0]
+    empty = outline_from_mesh(TriangleMesh.empty())
+    cube, camera = outline_from_mesh(box(0.5)), CAMERAS[0]
     assert not draw_mask([empty], np.eye(4)[None], camera).any()
     assert not draw_mask([], np.zeros((0, 4, 4)), camera).any()
     both = draw_mask([empty, cube], np.tile(np.eye(4), (2, 1, 1)), camera)
@@ -126,7 +103,7 @@ def test_empty_surfaces_have_no_area():
     assert score_bodies([cube], np.zeros((0, 1, 4, 4)), camera, none).shape == (0, 1)
 
 
-@pytest.mark.parametrize("camera", CAMERAS, ids=name_of)
+@each_camera
 def test_subtracting_a_body_updates_prefix_sums(camera):
     rng = np.random.default_rng(7)
     mask = rng.random((camera.height, camera.width)) < 0.7
@@ -142,19 +119,16 @@ def test_subtracting_a_body_updates_prefix_sums(camera):
         assert not prefix[:, 0].any()
 
 
-@pytest.mark.parametrize(
-    ("poses", "columns", "words"),
-    [
+def test_wrong_shapes_are_refused():
+    for poses, columns, words in (
         (np.eye(4)[None, None], 90, "prefixes of camera 'parallel'"),
         (np.eye(4)[None, None, :3, :3], 91, "poses"),
         (np.tile(np.eye(4), (1, 2, 1, 1)), 91, "poses"),
         (np.full((1, 1, 4, 4), np.nan), 91, "finite"),
-    ],
-)
-def test_wrong_shapes_are_refused(poses, columns, words):
-    prefixes = np.zeros((0, 70, columns), dtype=np.int32)
-    with pytest.raises(ValueError, match=words):
-        score_bodies([outline_from_mesh(box(1.0))], poses, CAMERAS[0], prefixes)
+    ):
+        prefixes = np.zeros((0, 70, columns), dtype=np.int32)
+        with pytest.raises(ValueError, match=words):
+            score_bodies([outline_from_mesh(box(1.0))], poses, CAMERAS[0], prefixes)
 
 
 PINHOLE = PinholeCamera("eye", 64, 48, 60.0, 60.0, 31.5, 23.5, np.eye(4))
@@ -162,9 +136,8 @@ PARALLEL = ParallelCamera("flat", 64, 48, 20.0, 31.5, 23.5, np.eye(4))
 CUBE = outline_from_mesh(box(1.0))
 
 
-@pytest.mark.parametrize(
-    ("camera", "places", "refused"),
-    [
+def test_a_body_that_a_camera_cannot_show_is_refused():
+    for camera, places, refused in (
         (PINHOLE, [(0, 0, 3)], None),
         (PARALLEL, [(0, 0, -3)], None),
         (PINHOLE, [(0, 0, 3), (0, 0, -3)], None),
@@ -173,13 +146,11 @@ CUBE = outline_from_mesh(box(1.0))
         (PINHOLE, [(0, 0, 3), (0.1, 0.2, 0.3)], "'eye' is inside"),
         (PINHOLE, [(50, 0, 3)], "'eye'.*outside the picture"),
         (PARALLEL, [(0, 50, 3)], "'flat'.*outside the picture"),
-    ],
-)
-def test_a_body_that_a_camera_cannot_show_is_refused(camera, places, refused):
-    X_CN = np.tile(np.eye(4), (len(places), 1, 1))
-    X_CN[:, :3, 3] = places
-    with nullcontext() if refused is None else pytest.raises(CameraError, match=refused):
-        require_visible([CUBE] * len(places), X_CN, camera)
+    ):
+        X_CN = np.tile(np.eye(4), (len(places), 1, 1))
+        X_CN[:, :3, 3] = places
+        with nullcontext() if refused is None else pytest.raises(CameraError, match=refused):
+            require_visible([CUBE] * len(places), X_CN, camera)
 
 
 def require_nearest(meshes, X_CN, camera):
@@ -199,10 +170,9 @@ def require_nearest(meshes, X_CN, camera):
     return image, int((np.isfinite(depths).sum(axis=0) > 1).sum())
 
 
-@pytest.mark.parametrize("camera", CAMERAS, ids=name_of)
+@each_camera
 def test_nearest_of_triangle_soups_is_labelled(camera):
-    rng = np.random.default_rng(4)
-    shared = 0
+    rng, shared = np.random.default_rng(4), 0
     for _ in range(15):
         meshes = [soup(rng, 12, int(rng.integers(1, 20)), 0.4) for _ in range(3)]
         X_CN = np.array([random_pose(rng, (0.1, -0.1, rng.uniform(2.5, 3.5))) for _ in meshes])
@@ -210,12 +180,11 @@ def test_nearest_of_triangle_soups_is_labelled(camera):
     assert shared > 1000
 
 
-@pytest.mark.parametrize("camera", CAMERAS, ids=name_of)
+@each_camera
 @pytest.mark.parametrize("inside_out", [False, True])
 def test_nearest_of_closed_bodies_is_labelled(camera, inside_out):
     # The bodies intersect, and the near plane cuts some.
-    rng = np.random.default_rng(5)
-    shared = 0
+    rng, shared = np.random.default_rng(5), 0
     for trial in range(10):
         middle = 2.0 if trial % 2 else 0.4
         meshes = [box(float(rng.uniform(0.3, 0.9))) for _ in range(4)]
@@ -231,11 +200,9 @@ def test_nearest_of_closed_bodies_is_labelled(camera, inside_out):
 
 def test_open_and_inconsistent_surfaces_are_not_closed():
     cube = box(1.0)
-    assert outline_from_mesh(cube).is_closed
-    assert not outline_from_mesh(TriangleMesh(cube.vertices, cube.triangles[1:])).is_closed
-    turned = cube.triangles.copy()
-    turned[0] = turned[0, ::-1]
-    assert not outline_from_mesh(TriangleMesh(cube.vertices, turned)).is_closed
+    turned = np.vstack([cube.triangles[:1, ::-1], cube.triangles[1:]])
+    for triangles in (cube.triangles[1:], turned):
+        assert not outline_from_mesh(TriangleMesh(cube.vertices, triangles)).is_closed
 
 
 def test_surfaces_of_one_label_are_united():
@@ -251,9 +218,8 @@ def test_surfaces_of_one_label_are_united():
 
 def directed_edges(triangles):
     """Every use of an edge: from, to, triangle, sorted."""
-    return sorted(
-        (int(t[k]), int(t[(k + 1) % 3]), i) for i, t in enumerate(triangles) for k in range(3)
-    )
+    numbered = enumerate(triangles.tolist())
+    return sorted((t[k], t[(k + 1) % 3], i) for i, t in numbered for k in range(3))
 
 
 def uses_of_records(edges):
@@ -275,25 +241,16 @@ def test_edge_records_contain_every_use_once():
         assert uses_of_records(outline.edges) == directed_edges(outline.triangles)
 
 
-def test_number_of_edge_records_is_minimal():
-    # Three triangles on one edge, two of which traverse it alike.
-    triangles = np.array([[0, 1, 2], [0, 1, 3], [1, 0, 4]], dtype=np.int32)
-    points = np.random.default_rng(1).normal(size=(5, 3))
-    outline = outline_from_mesh(TriangleMesh(points, triangles))
-    assert len(outline.edges) == 2 + 6
+CORNERS = box(1.0).vertices[box(1.0).triangles].reshape(-1, 3)
 
 
-def test_equal_vertices_are_merged():
-    mesh = box(1.0)
-    split = TriangleMesh(
-        np.vstack([mesh.vertices[mesh.triangles].reshape(-1, 3), [[9.0, 9.0, 9.0]]]),
-        np.arange(36, dtype=np.int32).reshape(-1, 3),
-    )
-    outline = outline_from_mesh(split)
-    assert len(outline.vertices) == 8
-    assert len(outline.edges) == 18
-
-
-def test_degenerate_triangles_are_left_out():
-    mesh = TriangleMesh(np.eye(3), np.array([[0, 1, 2], [0, 0, 1], [2, 2, 2]], dtype=np.int32))
-    assert len(outline_from_mesh(mesh).triangles) == 1
+def test_numbers_of_vertices_triangles_and_edge_records():
+    for points, triangles, found in (
+        # Three triangles on one edge, two of which traverse it alike: two records of it.
+        (np.vstack([np.eye(3), -np.eye(2, 3)]), [[0, 1, 2], [0, 1, 3], [1, 0, 4]], (5, 3, 8)),
+        # Equal vertices are merged; unused ones and degenerate triangles are left out.
+        (np.vstack([CORNERS, [[9.0, 9.0, 9.0]]]), np.arange(36).reshape(-1, 3), (8, 12, 18)),
+        (np.eye(3), [[0, 1, 2], [0, 0, 1], [2, 2, 2]], (3, 1, 3)),
+    ):
+        outline = outline_from_mesh(TriangleMesh(points, np.array(triangles, dtype=np.int32)))
+        assert (len(outline.vertices), len(outline.triangles), len(outline.edges)) == found

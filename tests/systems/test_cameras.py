@@ -3,7 +3,6 @@
 import cv2
 import numpy as np
 import pytest
-from pydrake.trajectories import PiecewisePolynomial
 
 from drake_pose.camera.camera_files import load_cameras, save_cameras
 from drake_pose.camera.models import circle_of_cameras, look_at
@@ -34,18 +33,6 @@ def test_masks_equal_the_label_renderers(person, standing, tmp_path):
         assert picture.shape == (120, 160, 3)
         near = cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
         assert np.ptp(picture[~near], axis=0).max() <= 1  # The background has one colour.
-
-
-def test_a_trajectory_moves_the_body(person, standing):
-    moved = standing.copy()
-    moved[person.position_index("position_y")] += 0.5
-    path = PiecewisePolynomial.FirstOrderHold([0.0, 1.0], np.column_stack([standing, moved]))
-    rig = build_camera_rig(person, circle_of_cameras(1, size=SIZE, face_camera=False), path)
-    context = rig.diagram.CreateDefaultContext()
-    first = rig.mask(context, "camera_0").nonzero()[1].mean()
-    context.SetTime(1.0)
-    last = rig.mask(context, "camera_0").nonzero()[1].mean()
-    assert abs(last - first) > 5
 
 
 def test_unknown_and_missing_cameras_are_refused(person):

@@ -81,7 +81,7 @@ def test_all_recorded_frames_are_shown_and_the_end_terminates():
     assert [row[1:] for row in found] == [(k, k) for k in range(5)]
     assert [row[0] for row in found] == pytest.approx([PERIOD * k for k in range(5)])
     assert not capture.take_reports()
-    assert capture.counts()["camera_1"].used == 5
+    assert capture.counts()["camera_1"]["used"] == 5
     capture.close()
     assert sources["camera_0"].closed
 
@@ -106,7 +106,8 @@ def test_a_camera_that_stops_and_returns_loses_only_its_own_pictures():
     stopped, returned = capture.take_reports()
     assert "'camera_1' stopped at 0.40 s" in stopped
     assert "'camera_1' returned at 1.50 s" in returned
-    assert [change.stopped for change in capture.counts()["camera_1"].changes] == [True, False]
+    changes = capture.counts()["camera_1"]["changes"]
+    assert [change["what"] for change in changes] == ["stopped", "returned"]
 
 
 def test_live_capture_shows_only_the_newest_frames():

@@ -63,16 +63,14 @@ class _StartedSearch(RootPlacementSearch):
         return super().match(views, root_position) if known is None else known
 
 
-def fit_body(
-    inputs: EstimateInputs, settings: EstimateSettings, on_stage: OnStage | None
-) -> FittedBody:
+def fit_body(inputs: EstimateInputs, settings: EstimateSettings, on_stage: OnStage) -> FittedBody:
     """Fit the body to a tracked sequence of one uncalibrated camera.
 
     Other inputs are returned unchanged, with {} and None: those of a calibrated camera, of a single
     frame, without tracking, or of a body that cannot change its shape or turn freely.
 
     ``inputs``: the inputs. ``settings``: settings of the estimate. ``on_stage``: called when the
-    fit begins; None: not called. Raises DrakePoseError: as for an estimate.
+    fit begins. Raises DrakePoseError: as for an estimate.
     """
     search, tracking = inputs.search, inputs.tracking()
     if (
@@ -83,8 +81,7 @@ def fit_body(
         or len(inputs.frames) < 2
     ):
         return inputs, {}, None
-    if on_stage is not None:
-        on_stage("fitting the body to the sequence", 0, None)
+    on_stage("fitting the body to the sequence", 0, None)
     return _BodyFit(inputs, settings, tracking).run(search)
 
 
@@ -101,13 +98,13 @@ class _BodyFit:
         self._more: dict[str, Any] = {}
         self._period = 1.0 / (inputs.scene.frame_rate_hz or USUAL_RATE_HZ)
 
-    def run(self, search: RootPlacementSearch, min_frames: int = 3) -> FittedBody:
+    def run(self, search: RootPlacementSearch) -> FittedBody:
         """Search the first frame, leave out hidden links, and fit the sequence.
 
-        If no pose is found in the first frame, the inputs are returned with {} and None.
+        If no pose is found in the first frame, the inputs are returned with {} and None. The shape
+        is fitted to three frames or more.
 
-        ``search``: search for the pose in the first frame. ``min_frames``: minimum length of a
-        sequence to which the shape is fitted.
+        ``search``: search for the pose in the first frame.
         """
         begin = time.perf_counter()
         first = search.match([View(self._camera, self._masks[0])])
@@ -121,7 +118,7 @@ class _BodyFit:
         )
         known = {0: self._estimate_of(own, starts[0].x, 0)}
         body = _Fitted(self._inputs.model, search, own, starts[0].x, known)
-        fitted = self._fit(tracker, starts) if len(self._masks) >= min_frames else None
+        fitted = self._fit(tracker, starts) if len(self._masks) >= 3 else None
         shapes = None
         frames, warnings = self._inputs.frames, self._inputs.warnings
         if fitted is not None:

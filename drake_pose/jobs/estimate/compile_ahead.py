@@ -20,6 +20,7 @@ from drake_pose.fit.surfaces import simplify_surfaces
 from drake_pose.search import MultiStartSearch, ViewsFit
 from drake_pose.search.multi_start import MEDIUM_STAGES, small_match
 from drake_pose.silhouette.outline import TreeSurfaces, pack
+from drake_pose.silhouette.scoring import draw_labels
 
 
 @contextmanager
@@ -46,6 +47,7 @@ def main() -> None:
     views = pack_views([view.camera], [find_edge_points(view.mask, 1.0)])
     X_WN = tree.node_poses(tree.default_values())
     compare_contours(pack(surfaces), X_WN, *views, np.ones((1, 4)), 0, 1.0, False)
+    draw_labels(surfaces, range(1, 1 + len(surfaces)), view.camera.X_CW @ X_WN, view.camera)
     fit, search = ViewsFit(TreeKinematics(tree), surfaces, [view]), MultiStartSearch(tree)
     fit.refine(fit.kinematics.flatten(tree.default_values()), MEDIUM_STAGES)
     search.match([view])

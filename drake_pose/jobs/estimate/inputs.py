@@ -21,24 +21,26 @@ from drake_pose.body import (
     model_warnings,
 )
 from drake_pose.camera.camera_files import intrinsics_of, load_cameras
+from drake_pose.camera.episode import JointLog
 from drake_pose.camera.episode_files import JOINT_TABLE, read_sequence
 from drake_pose.camera.models import Camera
+from drake_pose.camera.picture_files import frame_key
 from drake_pose.errors import ModelError, SceneError, SettingsError, UnknownNameError
+from drake_pose.files.folder import OVERLAY
+from drake_pose.files.overlay import draw_overlay
 from drake_pose.files.records import FrameRecord, base_cells, user_units
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.files.writer import Drawn
 from drake_pose.filtering.contour_tracker import TrackingSettings
+from drake_pose.input_files import read_csv
 from drake_pose.jobs.estimate.measurements import (
-    MeasuredPositions,
-    check_units,
-    frame_times,
-    has_times,
     is_episode,
     logged_positions,
     read_episode_scene,
     read_joint_centres,
     read_measured_positions,
     timed_positions,
+    with_leaders,
 )
 from drake_pose.person.search import PERSON_LANDMARKS
 from drake_pose.search import (
@@ -63,27 +65,11 @@ from drake_pose.silhouette.pictures.scene_checks import (
 from drake_pose.silhouette.pictures.scenes import CAMERA_FILE, SCENE_FILE, Scene
 from drake_pose.silhouette.scoring import draw_labels, draw_mask, require_visible
 
+INTERVAL = math.radians(10.0)
+"""Sampling interval of joint angles [rad]."""
 
-def make_search(
-    model: ArticulatedModel,
-    settings: EstimateSettings,
-    position: np.ndarray | None,
-    interval_deg: float = 10.0,
-) -> PoseSearch:
-    """Return the search for a body with a known root position.
-
-    It is a PaperSearch for the method "paper", otherwise a MultiStartSearch.
-
-    Args:
-        model: the body's model.
-        settings: method, root, root rotation and held positions.
-        position: (3,) position of the root in the world [m]; None: as the model has it.
-        interval_deg: sampling interval of the published search [deg].
-    """
-    tree = make_tree(model, settings, position)
-    if settings.method == "paper":
-        return PaperSearch(tree, PaperSearchSettings(math.radians(interval_deg)))
-    return MultiStartSearch(tree)
+FREE_ROOT = RootRotation.free(interval_deg=30.0)
+"""Of a body whose position is searched as well."""
 
 
 def make_placement_search(
@@ -91,8 +77,6 @@ def make_placement_search(
     settings: EstimateSettings,
     position: np.ndarray | None,
     scale_unknown: bool,
-    interval_deg: float = 10.0,
-    free_interval_deg: float = 30.0,
 ) -> RootPlacementSearch:
     """Return the search for a body with an unknown root position.
 
@@ -104,8 +88,6 @@ def make_placement_search(
         settings: method, root, root rotation and held positions.
         position: (3,) start of the root position in the world [m]; None: the origin.
         scale_unknown: whether the scale of a parallel camera is searched as well.
-        interval_deg: sampling interval of joint angles [deg].
-        free_interval_deg: sampling interval of a freely turning root [deg].
 
     Raises SettingsError: the method is "paper".
     """
@@ -117,13 +99,11 @@ def make_placement_search(
     first = np.zeros(3) if position is None else position
     tree = make_tree(model, settings, None if settings.root is None else first)
     if settings.root is None and settings.root_rotation is None and root_rotates_freely(tree):
-        rotation = RootRotation.free(interval_deg=free_interval_deg)
         held = _in_plant_units(model, settings.hold)
         tree = model.pose_tree(
-            most_connected_node(tree), root_position=first, root_rotation=rotation, held=held
+            most_connected_node(tree), root_position=first, root_rotation=FREE_ROOT, held=held
         )
-    sampling = BeamSearchSettings(math.radians(interval_deg))
-    return RootPlacementSearch(tree, sampling, scale_unknown)
+    return RootPlacementSearch(tree, BeamSearchSettings(INTERVAL), scale_unknown)
 
 
 def make_tree(
@@ -204,7 +184,7 @@ class EstimateInputs:
     tracked: bool  # Whether the body is tracked from frame to frame.
     search: PoseSearch | None  # Search for the body's pose; None for the method person.
     # Measured joint positions to compare with; None if there are none.
-    truth: MeasuredPositions | None
+    truth: JointLog | None
     warnings: tuple[str, ...] = ()  # Messages for the user.
     # Position (3,) of the root by frame [m]; None if it is the same in all.
     root_positions: Mapping[str, np.ndarray] | None = None
@@ -215,7 +195,7 @@ class EstimateInputs:
 
     def joint_errors(self, frame: str, q: np.ndarray) -> dict[str, float]:
         """Return q (nq,) minus measured positions by name [deg or m]; empty if not measured."""
-        if self.truth is None or (values := self.truth.of(frame)) is None:
+        if self.truth is None or (values := self.truth.by_frame.get(frame_key(frame))) is None:
             return {}
         places = [self.model.position_index(name) for name in self.truth.names]
         errors = q[places] - values
@@ -249,8 +229,7 @@ class EstimateInputs:
             shown: masks or pictures by camera over which the body is drawn.
             more: other fields of FrameRecord by name.
 
-        Returns the record, without pose if none was found; and by camera of ``shown`` the mask or
-        picture, and its ``parts`` or None.
+        Returns the record, without pose if none was found, and the overlays of ``shown``.
         """
         q, base, E_total = np.full(len(pose.q), np.nan), None, None
         if pose.found:
@@ -263,7 +242,14 @@ class EstimateInputs:
         record = FrameRecord(
             frame, q, base, E_total, pose.seconds, stopped_by=pose.stopped_by, **more
         )
-        return record, {name: (seen, parts.get(name)) for name, seen in shown.items()}
+        fit = "no pose found" if E_total is None else f"E_total {100.0 * E_total:.1f} %"
+        drawn = {}
+        for name, seen in shown.items():
+            nodes = parts.get(name)
+            body = np.zeros(seen.shape[:2], np.bool_) if nodes is None else nodes >= 0
+            picture = draw_overlay(seen, body, nodes, f"{name}  frame {frame}  {fit}")
+            drawn[f"{OVERLAY}/{name}/{frame}.png"] = picture
+        return record, drawn
 
     def tracking(self, rest_time: float = 1.0) -> TrackingSettings | None:
         """Return the tracker's settings, also for a searched root or scale. None: no tracking.
@@ -310,6 +296,8 @@ def read_inputs(
     Raises DrakePoseError: the message names the file, camera, frame, link or joint at fault.
     """
     model = load_model(model_path, package_paths=settings.packages)
+    if settings.unseen:
+        model, settings = leave_out_links(model, settings)
     # A sequence of pictures starts at a mask, at settings.start, or at its logged positions.
     has_log = settings.start is None and (truth_path or scene_path / JOINT_TABLE).is_file()
     if is_episode(scene_path, settings) and (
@@ -317,8 +305,6 @@ def read_inputs(
     ):
         scene = read_episode_scene(scene_path, settings, truth_path, camera_path)
         frames = scene.frames
-        if settings.unseen:
-            model, settings = leave_out_links(model, settings)
         truth, starts, of_truth = logged_positions(scene, make_tree(model, settings), settings)
     else:
         # Frames of a captured person are a sequence.
@@ -329,8 +315,6 @@ def read_inputs(
             cameras=None if camera_path is None else load_cameras(camera_path, known, scene_path),
             sequence=is_person, every=settings.every,
         )  # fmt: skip
-        if settings.unseen:
-            model, settings = leave_out_links(model, settings)
         truth, of_truth = _read_truth(scene_path, truth_path, model, frames)
         starts = {}
     tracked = scene.sequence and settings.track
@@ -360,8 +344,11 @@ def read_inputs(
     if root == "unknown" or scene.scale_unknown:
         search = make_placement_search(model, settings, position, scene.scale_unknown)
     else:
-        search = make_search(model, settings, position)
-        tree, start = search.tree, starts.get(frames[0])
+        tree, start = make_tree(model, settings, position), starts.get(frames[0])
+        is_paper = settings.method == "paper"
+        search = (
+            PaperSearch(tree, PaperSearchSettings(INTERVAL)) if is_paper else MultiStartSearch(tree)
+        )
         values = tree.default_values() if start is None else tree.values_from_positions(start)
         X_WN = tree.node_poses(values)
         for camera in scene.cameras.values():
@@ -390,7 +377,7 @@ def draw_parts(
 
 def _read_truth(
     scene: Path, given: Path | None, model: ArticulatedModel, frames: Sequence[str]
-) -> tuple[MeasuredPositions | None, tuple[str, ...]]:
+) -> tuple[JointLog | None, tuple[str, ...]]:
     """Return the measured positions of a scene's folder, None if there are none, and warnings.
 
     ``given``: the table; None: joint_angles.csv, ignored if it belongs to another model. There is a
@@ -400,14 +387,14 @@ def _read_truth(
     if given is None and not os.path.lexists(path):
         return None, ()
     try:
-        truth = read_measured_positions(path, model.position_names)
+        truth = read_measured_positions(path, model)
     except UnknownNameError:
         if given is not None:
             raise
         # The scene's table belongs to another model.
         return None, ()
-    warnings = check_units(path, model, truth.names, truth.values)
-    if all(truth.of(frame) is None for frame in frames):
+    warnings = truth.warnings
+    if not any(frame_key(frame) in truth.by_frame for frame in frames):
         warnings += (f"{path}: has no row of an estimated frame, so that nothing is compared",)
     return truth, warnings
 
@@ -425,20 +412,16 @@ def _read_starts(
     file = settings.start
     if file is None:
         return {}
-    if has_times(file):
-        times = frame_times(scene)
-        starts = timed_positions(file, times, make_tree(model, settings), settings)[1]
+    if "time" in read_csv(file, SceneError)[0]:
+        starts = timed_positions(file, scene, make_tree(model, settings), settings)[1]
         starts = {frame: q for frame, q in starts.items() if frame in frames}
     else:
-        known = read_measured_positions(file, model.position_names)
-        check_units(file, model, known.names, known.values)
-        places = [model.position_index(name) for name in known.names]
-        starts = {}
-        for frame in frames:
-            values = known.of(frame)
-            if values is not None:
-                starts[frame] = model.default_positions.copy()
-                starts[frame][places] = values
+        known = read_measured_positions(file, model)
+        q, _, _ = with_leaders(model, model.couplings, known.names, known.positions)
+        of_key = dict(zip(known.by_frame, q, strict=True))
+        own = {frame: of_key[key] for frame in frames if (key := frame_key(frame)) in of_key}
+        default = model.default_positions
+        starts = {frame: np.where(np.isnan(row), default, row) for frame, row in own.items()}
     if frames[0] not in starts:
         raise SceneError(
             f"{file}: has no row of the first frame, '{frames[0]}', at which the track starts"

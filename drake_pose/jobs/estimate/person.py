@@ -1,20 +1,20 @@
 """Estimates of one person with several cameras, and their warnings."""
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from drake_pose.arrays import Array, Mask
+from drake_pose.arrays import Mask
 from drake_pose.body import landmark_positions, load_landmarks
-from drake_pose.errors import MaskError
+from drake_pose.errors import MaskError, weighted
 from drake_pose.files.records import FrameRecord, record_modes
 from drake_pose.files.writer import Drawn, OnStage, ResultWriter
 from drake_pose.jobs.estimate.inputs import EstimateInputs, draw_parts
 from drake_pose.person.capture import PersonCapture, capture_checked
 from drake_pose.person.faults import CameraFault, RigFault
-from drake_pose.person.figures import ReadFrame, ViewFaults
+from drake_pose.person.figures import ViewFaults
 from drake_pose.search import PoseEstimate
 from drake_pose.silhouette.pictures.scene_checks import (
     describe_unreadable,
@@ -27,7 +27,7 @@ FOLLOWED = "followed"
 
 
 def follow_person(
-    inputs: EstimateInputs, result: ResultWriter, overlay: bool, on_stage: OnStage | None
+    inputs: EstimateInputs, result: ResultWriter, overlay: bool, on_stage: OnStage
 ) -> tuple[EstimateInputs, Iterator[tuple[FrameRecord, Drawn]]]:
     """Estimate a person in all frames.
 
@@ -37,7 +37,7 @@ def follow_person(
         inputs: the inputs.
         result: writer of the result; gets lengths, radius scales, and finally warnings.
         overlay: whether overlays are drawn.
-        on_stage: called with the progress of each stage; None: not called.
+        on_stage: called with the progress of each stage.
 
     Returns the inputs with all frames to be written, and an iterator of their records and overlays.
     If all frames are finished already: the given inputs, and an empty iterator.
@@ -58,7 +58,7 @@ def follow_person(
         inputs.tracked, reader.count_followed,
     )  # fmt: skip
     captured = checked.captured
-    reader.on_stage = None
+    reader.on_stage = lambda *_: None
     seconds = (time.perf_counter() - begin) / len(inputs.frames)
     result.records.clear()
     result.begin()
@@ -71,8 +71,21 @@ def follow_person(
         values = [captured.tree.values_from_positions(q) for q in captured.q]
         nodes = [np.array(own) for own in zip(*values, strict=True)]
         for index, X_WN in enumerate(captured.tree.node_poses_batch(nodes)):
-            masks = checked.read(index)
-            yield _record_frame(inputs, captured, index, X_WN, masks, reader, seconds, overlay)
+            frame, q, masks = inputs.frames[index], captured.q[index], checked.read(index)
+            shown = masks if overlay else {}
+            # Overlays show cameras that were left out as well.
+            if overlay and len(masks) < len(inputs.scene.cameras_of(frame)):
+                shown = {**reader(index), **masks}
+            found = bool(np.isfinite(q).all())
+            seen = [inputs.scene.cameras[name] for name in ({**masks, **shown} if found else {})]
+            parts = draw_parts(captured.outlines, X_WN, seen, by_part=overlay)
+            pose = PoseEstimate(
+                found, q, np.eye(4), (), np.nan, 1.0, stopped_by=FOLLOWED, seconds=seconds
+            )
+            answers = ((q, captured.deviations[index]), *captured.alternatives.get(index, ()))
+            known = record_modes(inputs.model, answers if found else answers[:1])
+            ratio = float(captured.inlier_ratios[index])
+            yield inputs.record_frame(frame, pose, masks, parts, shown, inlier_ratio=ratio, **known)
         frames = inputs.frames
         result.warnings += (
             *describe_unreadable(reader.refused, inputs.scene.frames),
@@ -90,11 +103,11 @@ class _Reader:
     """Reads the masks of frames; masks that cannot be read are left out and recorded.
 
     Attributes:
-        on_stage: called with the progress of each stage; None: not called.
+        on_stage: called with the progress of each stage.
         refused: why a mask cannot be read, by camera and frame.
     """
 
-    def __init__(self, inputs: EstimateInputs, on_stage: OnStage | None) -> None:
+    def __init__(self, inputs: EstimateInputs, on_stage: OnStage) -> None:
         self._scene, self._frames = inputs.scene, inputs.frames
         self.on_stage = on_stage
         self.refused: dict[tuple[str, str], str] = {}
@@ -114,56 +127,17 @@ class _Reader:
         # The first pass over all frames reads the masks; later calls belong to later stages.
         count, again = len(self._frames), self._read_count - len(self._frames)
         if again <= 0:
-            self._tell("reading", self._read_count, count)
+            self.on_stage("reading", self._read_count, count)
         elif not self._followed:
-            self._tell("finding and measuring the person", again, None)
+            self.on_stage("finding and measuring the person", again, None)
         elif self._followed >= count:
-            self._tell("comparing the cameras", again, None)
+            self.on_stage("comparing the cameras", again, None)
         return masks
 
     def count_followed(self, _: int) -> None:
         """Count a frame in which the person was tracked; its index is not used."""
         self._followed += 1
-        self._tell("tracking", self._followed, len(self._frames))
-
-    def _tell(self, what: str, done: int, of: int | None) -> None:
-        """Call ``on_stage`` with a stage, the work done, and all its work (None if unknown)."""
-        if self.on_stage is not None:
-            self.on_stage(what, done, of)
-
-
-def _record_frame(
-    inputs: EstimateInputs,
-    captured: PersonCapture,
-    index: int,
-    X_WN: Array,
-    masks: Mapping[str, Mask],
-    reader: ReadFrame,
-    seconds: float,
-    overlay: bool,
-) -> tuple[FrameRecord, Drawn]:
-    """Return the record and overlays of a frame of a captured person.
-
-    ``index``: of the frame. ``X_WN``: (nodes, 4, 4) the body's nodes in the world [m]. ``masks``:
-    by camera, of those used. ``seconds``: time per frame [s]. ``overlay``: whether overlays are
-    drawn.
-    """
-    scene, frame, q = inputs.scene, inputs.frames[index], captured.q[index]
-    shown: dict[str, Mask] = {}
-    # Overlays show cameras that were left out as well.
-    if overlay and len(masks) < len(scene.cameras_of(frame)):
-        shown |= reader(index)
-    if overlay:
-        shown |= masks
-    found = bool(np.isfinite(q).all())
-    seen = [scene.cameras[name] for name in ({**masks, **shown} if found else {})]
-    parts = draw_parts(captured.outlines, X_WN, seen, by_part=overlay)
-    pose = PoseEstimate(found, q, np.eye(4), (), np.nan, 1.0, stopped_by=FOLLOWED, seconds=seconds)
-    answers = ((q, captured.deviations[index]), *captured.alternatives.get(index, ()))
-    known = record_modes(inputs.model, answers if found else answers[:1])
-    return inputs.record_frame(
-        frame, pose, masks, parts, shown, inlier_ratio=float(captured.inlier_ratios[index]), **known
-    )
+        self.on_stage("tracking", self._followed, len(self._frames))
 
 
 def describe_views(views: ViewFaults, frames: Sequence[str]) -> tuple[str, ...]:
@@ -251,7 +225,7 @@ def describe_rig(rig: RigFault | None) -> tuple[str, ...]:
             "mirrored pictures, calibrate again"
         )
     filled = f"{100.0 * rig.filled[worst]:.0f} % of camera '{worst}'"
-    return (f"no body fills all silhouettes ({filled}){what}",)
+    return (weighted(f"no body fills all silhouettes ({filled}){what}", "wrong"),)
 
 
 def describe_camera(fault: CameraFault, frames: Sequence[str]) -> str:

@@ -12,9 +12,9 @@ from pydrake.systems.analysis import Simulator
 
 from drake_pose.body import nearest_turn
 from drake_pose.camera.models import ParallelCamera
-from drake_pose.errors import SettingsError, listed
-from drake_pose.files.folder import SHAPES, writes_folder
-from drake_pose.files.overlay import encode_png
+from drake_pose.errors import SettingsError, listed, weighted
+from drake_pose.files.folder import OVERLAY_MODES, SHAPES, writes_folder
+from drake_pose.files.overlay import draw_modes, encode_png
 from drake_pose.files.records import (
     BADLY_EXPLAINED,
     FrameRecord,
@@ -34,6 +34,7 @@ from drake_pose.search import (
     BeamSearch,
     MultiStartSearch,
     PoseEstimate,
+    PoseMode,
     PoseSearch,
     View,
     scale_camera,
@@ -56,8 +57,8 @@ def estimate_scene(
     resume: bool = False,
     replay: bool = True,
     overlay: bool = True,
-    on_frame: OnFrame | None = None,
-    on_stage: OnStage | None = None,
+    on_frame: OnFrame = lambda *_: None,
+    on_stage: OnStage = lambda *_: None,
 ) -> SceneEstimate:
     """Estimate the positions of a body in every frame of a scene.
 
@@ -73,8 +74,8 @@ def estimate_scene(
         cameras: camera file; None: the scene's own.
         resume: continue the interrupted result in ``out``.
         replay, overlay: whether replay.html and overlays are written.
-        on_frame: called before the first and after each frame; None: not called.
-        on_stage: called with the progress of stages before and after the frames; None: not called.
+        on_frame: called before the first and after each frame.
+        on_stage: called with the progress of stages before and after the frames.
 
     Raises:
         DrakePoseError: the message names the file, camera, frame, link or joint at fault.
@@ -195,39 +196,47 @@ def match_frames(
         known = record_pose_set(pose.pose_set, search.tree) or {
             "joints": record_deviations(model, pose.q, nothing)
         }
-        yield inputs.record_frame(
+        record, drawn = inputs.record_frame(
             frame, pose, masks, parts, shown, **more, **known, runs=pose.runs,
             outside_limit=pose.outside_limit, explained=pose.explained,
         )  # fmt: skip
+        if shown and pose.found and pose.stopped_by != TRACKED:
+            poses: list[PoseMode | PoseEstimate] = [pose]
+            if pose.pose_set is not None and pose.pose_set.modes:
+                poses = [*pose.pose_set.modes[:3]]
+            bodies = []
+            for one in poses:
+                values = tree.values_from_positions(one.q)
+                bodies.append((surfaces.at(values), one.X_WB @ tree.node_poses(values)))
+            # Parts with determined joints are blue.
+            sure = {name for name, joint in record.joints.items() if joint["determined"]}
+            is_sure = np.array([sure.issuperset(node.value_names) for node in tree.nodes])
+            picture = draw_modes(bodies, cameras[0], is_sure)
+            drawn = {**drawn, f"{OVERLAY_MODES}/{frame}.png": picture}
+        yield record, drawn
 
 
 def compare_cameras(
     inputs: EstimateInputs,
     search: PoseSearch,
     records: Mapping[str, FrameRecord],
-    on_stage: OnStage | None,
+    on_stage: OnStage,
     doubtful: float = 0.12,
-    inconsistent_below: float = 0.5,
-    frame_count: int = 2,
-    pair_count: int = 3,
 ) -> list[str]:
     """Return a warning of cameras that are exchanged or inconsistent, if the poses fit badly.
 
-    The result is [] if there is no such camera. A few frames are searched again with single
-    cameras, and with exchanged masks.
+    The result is [] if there is no such camera. Two frames are searched again with exchanged masks
+    of the three worst cameras, without each of them, and with single cameras. What halves E_total
+    is the cause.
 
     Args:
         inputs: the inputs.
         search: the search.
         records: estimates by frame.
-        on_stage: called before the comparison; None: not called.
+        on_stage: called before the comparison.
         doubtful: median E_total from which two cameras are compared. Three or more are compared
             only from BADLY_EXPLAINED on: a real person before four cameras has an E_total of 15 to
             18 %, and a single inconsistent camera is detected by its IoU.
-        inconsistent_below: cameras are inconsistent if the E_total of single cameras is less than
-            this fraction of that of all cameras; the same threshold confirms an exchange.
-        frame_count: number of frames that are compared.
-        pair_count: number of pairs of cameras whose masks are exchanged.
     """
     scene, cameras = inputs.scene, inputs.scene.cameras
     known = {f: one.E_total for f, one in records.items() if one.E_total is not None}
@@ -237,11 +246,10 @@ def compare_cameras(
         return []
     whole = [f for f in known if all((name, f) in scene.masks for name in cameras)]
     # Frames near the median error: the worst may have other faults as well.
-    chosen = sorted(whole, key=lambda frame: abs(known[frame] - usual))[:frame_count]
+    chosen = sorted(whole, key=lambda frame: abs(known[frame] - usual))[:2]
     if not chosen:
         return []
-    if on_stage is not None:
-        on_stage("comparing the cameras", 0, None)
+    on_stage("comparing the cameras", 0, None)
     masks = {frame: {name: scene.read(name, frame) for name in cameras} for frame in chosen}
 
     def error(owners: Mapping[str, str]) -> float:
@@ -255,41 +263,39 @@ def compare_cameras(
 
     together = float(np.mean([known[frame] for frame in chosen]))
     ious = {n: np.mean([records[f].ious.get(n, 0.0) for f in chosen]) for n in cameras}
-    worst = sorted(cameras, key=lambda name: ious[name])
+    worst = sorted(cameras, key=lambda name: ious[name])[:3]
     sizes = {name: (camera.width, camera.height) for name, camera in cameras.items()}
-    alike = [pair for pair in combinations(worst, 2) if sizes[pair[0]] == sizes[pair[1]]]
-    for one, other in alike[:pair_count]:
+    for one, other in combinations(worst, 2):
+        if sizes[one] != sizes[other]:
+            continue
         after = error({n: {one: other, other: one}.get(n, n) for n in cameras})
-        if after < inconsistent_below * together:
-            return [
+        if after < 0.5 * together:
+            text = (
                 f"cameras '{one}' and '{other}' seem to be exchanged: E_total is "
                 f"{percent(together)}, but {percent(after)} with each other's masks; exchange "
                 "their folders of masks, or their names in cameras.yaml"
-            ]
-    alone = {name: error({name: name}) for name in cameras}
-    areas = [sum(float(own[name].sum()) for own in masks.values()) for name in cameras]
-    bad: Sequence[str] = [name for name in cameras if alone[name] >= BADLY_EXPLAINED]
-    good = [alone[name] for name in cameras if name not in bad]
-    if np.average(list(alone.values()), weights=areas) < inconsistent_below * together:
-        left = {
-            n: error({m: m for m in worst if m != n}) for n in worst[:pair_count] if len(worst) > 2
-        }
-        first = min(left, key=lambda name: left[name], default="")
-        bad = [first] if first and left[first] < inconsistent_below * together else list(cameras)
-    # A single camera with a wrong pose may fit badly even alone.
-    elif not (bad and good and max(good) < inconsistent_below * min(alone[name] for name in bad)):
+            )
+            return [weighted(text, "wrong")]
+    without = {one: error({n: n for n in cameras if n != one}) for one in worst}
+    bad = [name for name in worst if without[name] < 0.5 * together]
+    if len(cameras) > 2:
+        bad = sorted(bad, key=lambda name: without[name])[:1]
+        if not bad and np.mean([error({name: name}) for name in cameras]) < 0.5 * together:
+            bad = list(cameras)
+    if not bad:
         return []
     names = " and ".join(f"'{name}'" for name in bad)
     what = f"cameras {names} are inconsistent"
-    if len(bad) < len(alone):
-        others = "the others" if len(alone) > 2 else "the other one"
+    if len(bad) == 1:
+        others = "the others" if len(cameras) > 2 else "the other one"
         what = f"camera {names} is inconsistent with {others}"
-    each = ", ".join(f"'{name}' {percent(left)}" for name, left in alone.items())
-    return [
-        f"{what}: E_total is {percent(together)} together, alone {each}; check whether a camera "
+    each = ", ".join(f"{percent(left)} without '{name}'" for name, left in without.items())
+    text = (
+        f"{what}: E_total is {percent(together)} together, {each}; check whether a camera "
         "has moved since its calibration, whether masks belong to another camera or time, and "
         "whether X_WC is the camera's pose in the world, in metres"
-    ]
+    )
+    return [weighted(text, "wrong")]
 
 
 def _match_again(
@@ -331,11 +337,12 @@ def check_track(
     off = nearest_turn(found.q, q, model.periodic) - q
     far = np.flatnonzero(np.abs(off) > 0.5 * np.abs(off).max())
     where = f", with other positions of {listed([model.position_names[k] for k in far])}"
-    return [
+    text = (
         f"frame '{worst}': E_total is {percent(tracked[worst])} by tracking, but "
         f"{percent(found.E_total)} by a search{where}: its pose is wrong, and those of other "
         "frames may be; search every frame (--no-track) and compare"
-    ]
+    )
+    return [weighted(text, "wrong")]
 
 
 def _is_worse(error: float, other: float) -> bool:

@@ -14,26 +14,38 @@ from typing import Any
 
 import numpy as np
 
-from drake_pose.arrays import Array
+from drake_pose.arrays import Array, Picture
+from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.camera_files import describe_camera
 from drake_pose.camera.models import Camera
-from drake_pose.errors import DrakePoseError, RegistrationError, SceneError, noted_warnings
+from drake_pose.errors import DrakePoseError, RegistrationError, listed, noted_warnings
 from drake_pose.files.folder import read_summary, write_summary, writes_folder
 from drake_pose.files.records import mask_digests, user_units
 from drake_pose.files.settings import AuditSettings, percent
 from drake_pose.jobs.estimate.measurements import left_out_warnings
-from drake_pose.jobs.registration.audit_page import undetectable_offsets, write_audit_page
 from drake_pose.jobs.registration.diagnosis import compare_camera, compare_clock
-from drake_pose.jobs.registration.inputs import RegistrationInputs, read_inputs, still_joints
-from drake_pose.jobs.registration.large_errors import SceneComparison
+from drake_pose.jobs.registration.inputs import (
+    RegistrationInputs,
+    on_link,
+    read_inputs,
+)
+from drake_pose.jobs.registration.large_errors import SceneComparison, SceneFit
+from drake_pose.jobs.registration.pages import audit_answer, audit_page
+from drake_pose.jobs.registration.positions import still_joints
 from drake_pose.jobs.registration.result import (
     describe_pose,
     describe_run,
     write_comparisons,
+    write_corrections,
     write_overlays,
 )
 from drake_pose.jobs.registration.tracks import (
+    compare_on_link,
+    describe_on_link,
     describe_pictures,
+    draw_tracks,
+    given_on_link,
+    register_on_link,
     register_recordings,
     say_refused,
     turn_of,
@@ -46,13 +58,14 @@ from drake_pose.jobs.registration.words import (
     shift_unit,
 )
 from drake_pose.registration.diagnosis import DIAGNOSIS
-from drake_pose.registration.findings import Diagnosis, Finding
+from drake_pose.registration.findings import Diagnosis, Finding, FrameDiagnosis
 from drake_pose.registration.picture_acceptance import (
     PictureRegistration,
     evaluate_pictures,
 )
 from drake_pose.registration.posed_frames import MultiViewFrame, PosedFrame
 from drake_pose.registration.register import RegistrationBody
+from drake_pose.registration.track_registration import TrackRegistration
 from drake_pose.silhouette.pictures.scene_checks import frame_ranges
 from drake_pose.workers import use_workers
 
@@ -68,14 +81,14 @@ class SceneAudit:
         audit: the diagnosis of all frames, with the findings.
         summary: contents of summary.json.
         warnings: for the user.
-        undetectable: offsets of joints that would not have been named, in words.
+        answer: the result in a few sentences.
         folder: the result's folder; None: nothing was written.
     """
 
     audit: Diagnosis
     summary: Mapping[str, Any]
     warnings: tuple[str, ...]
-    undetectable: str
+    answer: str
     folder: Path | None
 
 
@@ -115,23 +128,37 @@ def audit_scene(
     table, file, folder = (None if one is None else Path(one) for one in (joints, cameras, out))
     with use_workers(settings.workers), noted_warnings() as noted:
         inputs = watch_cameras(read_inputs(Path(scene), Path(model), table, file, settings))
-        noted += (*inputs.warnings, *still_joints(inputs))
-        pictures = _Pictures()
-        if inputs.recordings:
-            given, (inputs, pictures) = inputs, _find_cameras(inputs, others=near)
+        noted += (*inputs.warnings, *still_joints(inputs.mapped, inputs.model))
+        pictures, tracks = _Pictures(), dict[str, TrackRegistration]()
+        frames, findings, given = list[FrameDiagnosis](), list[Finding](), inputs
+        standing = [one.name for one in inputs.searched_cameras if one.name not in inputs.links]
+        compared: SceneFit | None = None
+        if inputs.links or inputs.riding:
+            tracks, frames, findings = _find_on_links(inputs, settings)
+            given = inputs.of_cameras([name for name in standing if name not in inputs.riding])
+        if not inputs.recordings:
             compared = SceneComparison(inputs, on_frame).run()
-            offset_joints = [k.name for k in compared.found.common if k.kind == "joint"]
-            if offset_joints:
-                # Masks were segmented with wrong offsets, so they are made again.
-                inputs, pictures = _find_cameras(given, pictures, offset_joints)
-                compared = SceneComparison(inputs).run()
-        else:
-            compared = SceneComparison(inputs, on_frame).run()
-    found, empty = compared.found, compared.empty_frames
-    found = replace(found, common=(*pictures.findings, *found.common))
+        elif given.searched_cameras and (given.given_cameras or not given.given_on_links):
+            try:
+                inputs, pictures, compared = _compare_standing(given, near, on_frame)
+            except RegistrationError as error:
+                findings += _refusals({one.name: error for one in given.searched_cameras})
+                if not tracks:
+                    raise
+    if not pictures.found and not tracks and inputs.recordings:
+        raise next(iter(inputs.riding.values()), RegistrationError(findings[0].text))
+    found, empty = (compared.found, compared.empty_frames) if compared else (Diagnosis((), ()), ())
+    common = (*pictures.findings, *findings, *found.common)
+    found = replace(found, common=common, frames=(*found.frames, *frames))
+    audited = {*pictures.found, *(one.name for one in common if one.kind == "refused")}
+    forgotten = [name for name in standing if inputs.recordings and name not in audited]
     seconds = time.perf_counter() - begin
-    warnings = [*inputs.warnings, *compared.warnings, *_audit_warnings(inputs, found, empty)]
-    names = [camera.name for camera in inputs.known_cameras]
+    warnings = [*inputs.warnings, *(compared.warnings if compared else ())]
+    warnings += _audit_warnings(inputs, found, empty)
+    warnings += [
+        f"camera '{name}' was not audited: no pose of it is given; drake-pose register finds it"
+        for name in forgotten
+    ]
     units = zip(inputs.model.position_names, user_units(inputs.model), strict=True)
     least = found.minimum_detectable
     center = found.center
@@ -139,25 +166,9 @@ def audit_scene(
         "findings": _describe_findings(found),
         "frame_count": len(found.frames),
         "agreeing_count": len(found.frames) - len(found.outliers),
-        "frames": {
-            frame.frame: {
-                "agrees": frame.finding is None,
-                "fits": dict(frame.given_ratios),
-                "fits_when_freed": dict(frame.fitted_ratios),
-                "pixels": frame.pixels,
-                "masks": mask_digests(inputs.scene, names, frame.frame),
-            }
-            for frame in found.frames
-        },
-        "found_cameras": {
-            name: describe_pictures(result)
-            | describe_pose("X_WC", result.found.camera.X_WC, result.found)
-            | {
-                "camera": describe_camera(result.found.camera),
-                "covariance": result.found.covariance.tolist(),
-            }
-            for name, result in pictures.found.items()
-        },
+        "frames": {one.frame: _describe_frame(inputs, one) for one in found.frames},
+        "found_cameras": {name: _describe_found(one) for name, one in pictures.found.items()}
+        | {name: describe_on_link(one, given.links[name]) for name, one in tracks.items()},
         "minimum_detectable": {
             name: unit * least[name] if math.isfinite(least[name]) else None
             for name, unit in units
@@ -167,11 +178,36 @@ def audit_scene(
         **describe_run(inputs, settings, warnings, seconds),
         "unseen": list(empty),
     }
-    if folder is not None:
-        _write_result(folder, inputs, found, pictures, overlay, summary)
     kinds = dict(zip(inputs.model.position_names, inputs.model.position_kinds, strict=True))
-    hidden = undetectable_offsets(summary["minimum_detectable"], kinds)
-    return SceneAudit(found, summary, tuple(warnings), hidden, folder)
+    if folder is not None:
+        for name, result in tracks.items() if overlay else ():
+            of = given_on_link(given, name, given.links[name])
+            draw_tracks(folder, result, of, prefix=f"{name}-")
+        _write_result(folder, inputs, found, pictures, overlay, summary, kinds)
+    return SceneAudit(found, summary, tuple(warnings), audit_answer(summary, kinds), folder)
+
+
+def _describe_frame(inputs: RegistrationInputs, one: FrameDiagnosis) -> dict[str, Any]:
+    """Return the part of summary.json on a frame."""
+    names = [camera.name for camera in inputs.known_cameras]
+    return {
+        "agrees": one.finding is None,
+        "fits": dict(one.given_ratios),
+        "fits_when_freed": dict(one.fitted_ratios),
+        "pixels": one.pixels,
+        "masks": mask_digests(inputs.scene, names, one.frame),
+    }
+
+
+def _describe_found(result: PictureRegistration) -> dict[str, Any]:
+    """Return the part of summary.json on a camera that stands still, as found in its pictures."""
+    found = result.found
+    return {
+        **describe_pictures(result),
+        **describe_pose("X_WC", found.camera.X_WC, found),
+        "camera": describe_camera(found.camera),
+        "covariance": found.covariance.tolist(),
+    }
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,6 +223,58 @@ class _Pictures:
     found: Mapping[str, PictureRegistration] = field(default_factory=dict)
     findings: tuple[Finding, ...] = ()
     names: Mapping[str, tuple[str, str]] = field(default_factory=dict)
+
+
+def _find_on_links(
+    inputs: RegistrationInputs, settings: AuditSettings
+) -> tuple[dict[str, TrackRegistration], list[FrameDiagnosis], list[Finding]]:
+    """Register each camera of an episode that rides on a link, and compare it with its given pose.
+
+    Returns the registrations by camera; for each of their pictures the fraction of its points that
+    fits, as a diagnosis; and the findings: poses that differ from the given ones, and cameras that
+    were refused.
+    """
+    tracks, frames = dict[str, TrackRegistration](), list[FrameDiagnosis]()
+    refused, findings = {**inputs.riding}, list[Finding]()
+    for name, link in inputs.links.items():
+        own, asked = on_link(inputs, name, settings)
+        try:
+            result = tracks[name] = register_on_link(own, asked, own.searched_cameras[0])
+        except RegistrationError as error:
+            refused[name] = error
+            continue
+        given = given_on_link(inputs, name, link)
+        difference = None if given is None else compare_on_link(result, given)
+        if difference is not None and difference.p_value <= DIAGNOSIS.significance:
+            findings.append(difference)
+        for one in result.found.frames:
+            ratios = {name: one.inlier_ratio}
+            frames.append(FrameDiagnosis(f"{name}-{one.frame}", ratios, ratios, 0.0, None))
+    return tracks, frames, [*findings, *_refusals(refused)]
+
+
+def _compare_standing(
+    given: RegistrationInputs, near: Path | None, on_frame: OnFrame | None
+) -> tuple[RegistrationInputs, _Pictures, SceneFit]:
+    """Find an episode's cameras that stand still, and compare its frames with them.
+
+    Returns the inputs of the found cameras, their registrations, and what was compared.
+
+    Raises RegistrationError: no camera is found.
+    """
+    inputs, pictures = _find_cameras(given, others=near)
+    compared = SceneComparison(inputs, on_frame).run()
+    offset_joints = [k.name for k in compared.found.common if k.kind == "joint"]
+    if offset_joints:
+        # Masks were segmented with wrong offsets, so they are made again.
+        inputs, pictures = _find_cameras(given, pictures, offset_joints)
+        compared = SceneComparison(inputs).run()
+    return inputs, pictures, compared
+
+
+def _refusals(refused: Mapping[str, RegistrationError]) -> list[Finding]:
+    """Return a finding for each refused camera, by name."""
+    return [Finding("refused", name, text=say_refused(why)) for name, why in refused.items()]
 
 
 def _find_cameras(
@@ -211,24 +299,24 @@ def _find_cameras(
         of its camera only, `known_cameras` have the poses that frames are compared with, and
         `given_cameras` are the cameras whose given pose is a finding.
 
-    Raises:
-        SceneError: no camera has a pose.
-        RegistrationError: no pose of any camera explains its pictures.
+    Raises RegistrationError: no pose of any camera explains its pictures.
     """
-    path = inputs.scene.path
-    if not inputs.given_cameras:
-        raise SceneError(
-            f"{path}: no camera has an X_WC that could be audited; give a camera file "
-            "(--cameras FILE), or estimate the poses: drake-pose register"
-        )
-    alone = len(inputs.given_cameras) == 1
+    # Without any given pose, cameras are compared at the poses found.
+    given_cameras = inputs.given_cameras or inputs.searched_cameras
+    alone = len(given_cameras) == 1
     body = RegistrationBody(inputs.tree, inputs.visible_nodes)
-    warnings = left_out_warnings(inputs.recordings, [one.name for one in inputs.given_cameras])
+    warnings = left_out_warnings(inputs.recordings, [one.name for one in given_cameras])
+    if not inputs.given_cameras:
+        named = listed([one.name for one in given_cameras])
+        warnings.append(
+            f"no X_WC is given of camera {named}: it was searched, and joints, clock and frames "
+            "are compared with the pose found"
+        )
     compared, findings = list[Camera](), list[Finding]()
     if before is not None:
         findings += [one for one in before.findings if one.kind == "refused"]
     names, frames = dict[str, tuple[str, str]](), list[MultiViewFrame]()
-    placed = {camera.name for camera in inputs.given_cameras} if before is None else before.found
+    placed = {camera.name for camera in given_cameras} if before is None else before.found
     refused = dict[str, RegistrationError]()
     searched = [camera for camera in inputs.searched_cameras if camera.name in placed]
     pictures = {
@@ -243,25 +331,23 @@ def _find_cameras(
             near=None if others is None else _found_poses(others),
         )
     }
-    findings += [
-        Finding("refused", name, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, text=say_refused(why))
-        for name, why in refused.items()
-    ]
+    findings += _refusals(refused)
     for camera in inputs.searched_cameras:
         motion = inputs.motions[camera.name]
         for pixels, what in ((motion.drift, "drifts"), (motion.shake, "shakes")):
             if pixels:
                 angle = turn_of(camera, pixels)
-                findings.append(
-                    Finding("moved", camera.name, angle, 0.0, 0.0, 0.0, pixels, 0.0, text=what)
-                )
-    for given in (camera for camera in inputs.given_cameras if camera.name in pictures):
+                findings.append(Finding("moved", camera.name, angle, pixels=pixels, text=what))
+    for given in (camera for camera in given_cameras if camera.name in pictures):
         name, recording, result = given.name, inputs.recordings[given.name], pictures[given.name]
         values = np.array([frame.values + result.joint_offsets for frame in result.frames])
-        difference = compare_camera(body, given, result.found, values, alone)
-        is_near = difference.pixels < near * result.fit.fit.views[0].size
+        is_near = bool(inputs.given_cameras)
+        if inputs.given_cameras:
+            difference = compare_camera(body, given, result.found, values, alone)
+            is_near = difference.pixels < near * result.fit.fit.views[0].size
+            is_off = not is_near and difference.p_value <= DIAGNOSIS.significance
+            findings += [difference] if is_off else []
         compared.append(given if is_near else result.found.camera)
-        findings += [] if is_near or difference.p_value > DIAGNOSIS.significance else [difference]
         findings += compare_clock(body, result, recording)
         segmented, _, lost = evaluate_pictures(body, result, result.found)
         for frame in segmented:
@@ -290,7 +376,7 @@ def _found_poses(folder: Path) -> dict[str, Array]:
     """
     try:
         found = read_summary(folder)["found_cameras"]
-        return {name: np.array(one["X_WC"]) for name, one in found.items()}
+        return {name: np.array(one["X_WC"]) for name, one in found.items() if "X_WC" in one}
     except (DrakePoseError, KeyError):
         return {}
 
@@ -337,6 +423,7 @@ def _write_result(
     pictures: _Pictures,
     overlay: bool,
     summary: Mapping[str, Any],
+    kinds: Mapping[str, str],
 ) -> None:
     """Write summary, page, overlays of outlier frames, and comparisons of wrong cameras.
 
@@ -347,8 +434,10 @@ def _write_result(
         pictures: results from an episode's pictures; empty for a scene of masks.
         overlay: whether overlays and comparisons are drawn.
         summary: contents of summary.json.
+        kinds: kind of each position by name.
     """
-    outliers, shown = found.outliers if overlay else (), {}
+    shown = dict[str, Picture]()
+    outliers = [one for one in found.outliers if one in inputs.scene.frames] if overlay else []
     for frame in outliers if pictures.names else ():
         camera_name, name = pictures.names[frame]
         shown[frame] = inputs.recordings[camera_name].picture(name)
@@ -365,8 +454,11 @@ def _write_result(
         write_comparisons(
             path, inputs, registration.frames, given, registration.found, registration.pictures
         )
+    if overlay:
+        write_corrections(path, inputs, found)
     write_summary(path, summary)
-    write_audit_page(path, inputs, found, summary, overlay)
+    joints = {name: kinds[name] for name in TreeKinematics(inputs.tree).names if name in kinds}
+    audit_page(path, summary, joints).write(path)
 
 
 def _describe_findings(found: Diagnosis) -> list[dict[str, Any]]:

@@ -12,7 +12,7 @@ from drake_pose.arrays import Array
 from drake_pose.body import TARGET_POSITIONS
 from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import Camera, PinholeCamera
-from drake_pose.errors import CameraError, RegistrationError
+from drake_pose.errors import CameraError, RegistrationError, weighted
 from drake_pose.files.records import BADLY_EXPLAINED
 from drake_pose.files.settings import percent
 from drake_pose.fit.parameters import POSE_NAMES
@@ -74,22 +74,16 @@ def lack_of_evidence(
         # Half of the frames and more that fit no common pose are outliers, which are named.
         if not found.agrees and not (evidence.holds and 2 * len(found.outliers) >= len(frames)):
             return "half of the frames fit as well at another pose of their own"
-        if evidence.holds and left_over(found) < BADLY_EXPLAINED:
-            return None
         if evidence.holds:
-            return (
-                f"the joints move as in them, but {percent(left_over(found))} of their area is off"
-            )
+            left = float(np.median([frame.E_total for frame in found.frames if frame.is_inlier]))
+            if left < BADLY_EXPLAINED:
+                return None
+            return f"the joints move as in them, but {percent(left)} of their area is off"
     with suppress(RegistrationError):
         chance = search.rough().register(found.camera, with_random_rows(search.kinematics, frames))
         if not fits_better(found.costs, chance.costs):
             return "joint positions drawn at random fit them about as well"
     return None
-
-
-def left_over(found: RegisteredCamera) -> float:
-    """Return the median E_total of the inlier frames."""
-    return float(np.median([frame.E_total for frame in found.frames if frame.is_inlier]))
 
 
 def require_explained(
@@ -221,11 +215,12 @@ def known_camera_warnings(
     left = float(np.median(E_total(overlap_areas(posed, camera.X_CW[None], np.inf)[0])))
     if left < BADLY_EXPLAINED:
         return []
-    return [
+    text = (
         f"camera '{camera.name}' is held at its X_WC, but the robot is not seen there: body and "
         f"silhouettes differ by {percent(left)} of the silhouettes' area; is its world another "
         f"than the robot's base? Register it anew with --camera {camera.name}"
-    ]
+    )
+    return [weighted(text, "wrong")]
 
 
 def require_determined(found: RegisteredCamera, max_sd: float = 0.04) -> None:
@@ -422,20 +417,19 @@ def last_before_change(wrong: Sequence[bool], least: int = 2) -> int | None:
 
 
 def base_motion(
-    given: Mapping[str, Camera], placed: Mapping[str, RegisteredCamera], sds: float = 4.0
+    placed: Sequence[tuple[Camera, RegisteredCamera]], sds: float = 4.0
 ) -> Finding | None:
     """Return the base's motion that explains the motions of all cameras; None: none does.
 
     One camera alone does not tell a motion of the base from its own. The finding's shift is that
     of the world's origin; its pixels and p-value are 0.
 
-    ``given``: cameras at their given poses, by name. ``placed``: registered cameras, by name; each
-    is in `given`. ``sds``: maximum difference between the cameras' motions [standard deviations],
-    to which 0.25 degrees and 3 mm are added.
+    ``placed``: cameras at their given poses, and as registered. ``sds``: maximum difference between
+    the cameras' motions [standard deviations], to which 0.25 degrees and 3 mm are added.
     """
-    motions = [given[name].X_WC @ camera.camera.X_CW for name, camera in placed.items()]
-    rotation_sd = max((camera.rotation_sd for camera in placed.values()), default=0.0)
-    shift_sd = max((camera.translation_sd for camera in placed.values()), default=0.0)
+    motions = [given.X_WC @ found.camera.X_CW for given, found in placed]
+    rotation_sd = max((found.rotation_sd for _, found in placed), default=0.0)
+    shift_sd = max((found.translation_sd for _, found in placed), default=0.0)
     differences = [pose_difference(motion, motions[0]) for motion in motions[1:]]
     most = sds * rotation_sd + np.radians(0.25), sds * shift_sd + 0.003
     if not differences or any(
@@ -445,4 +439,4 @@ def base_motion(
         return None
     motion = pose_difference(motions[0], np.eye(4))
     size = float(np.linalg.norm(motion[:3])), float(np.linalg.norm(motion[3:]))
-    return Finding("base", "base", *size, rotation_sd, shift_sd, 0.0, 0.0)
+    return Finding("base", "base", *size, rotation_sd, shift_sd)

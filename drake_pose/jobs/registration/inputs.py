@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
 
@@ -17,28 +17,26 @@ from drake_pose.camera.camera_files import (
     load_camera_file,
     load_cameras,
 )
-from drake_pose.camera.episode import EpisodeCamera
+from drake_pose.camera.episode import JointLog, Stream
 from drake_pose.camera.episode_files import JOINT_TABLE, open_episode, require_recording
-from drake_pose.camera.joint_map import MappedJoints
 from drake_pose.camera.models import Camera, Lens, PinholeCamera
 from drake_pose.errors import (
     CameraError,
     MaskError,
+    RegistrationError,
     SceneError,
     SettingsError,
-    UnknownNameError,
     require_known,
 )
 from drake_pose.files.settings import ALL, AuditSettings, EstimateSettings, RegistrationSettings
 from drake_pose.jobs.estimate.inputs import make_tree, missing_for_person
 from drake_pose.jobs.estimate.measurements import (
-    TreeLog,
     cameras_of,
-    frames_of,
     is_episode,
     is_timed,
     kept_pictures,
     map_log,
+    posed_nodes,
     read_measured_positions,
     rows_of,
 )
@@ -46,6 +44,7 @@ from drake_pose.jobs.registration.positions import (
     KnownPositions,
     estimate_positions,
     make_registration_tree,
+    own_joints,
     put_on_base,
     read_known_positions,
     read_target,
@@ -78,6 +77,10 @@ class RegistrationInputs:
         known_cameras: cameras whose poses are held, or audited.
         searched_cameras: cameras to be registered; all cameras of an episode.
         given_cameras: the searched cameras that have an X_WC, at that pose.
+        links: link of each searched camera of an episode that rides on one, by the camera's name;
+            for those in `given_on_links` by name, else as its pictures show (``watch_cameras``).
+        given_on_links: the searched cameras that have an X_LC, at that pose on their link.
+        riding: by name of a camera that moves with the robot, why it is not registered.
         assumed_focal: names of cameras without a given focal length, which have a usual one.
         left_out: names of cameras without X_WC that are not to be registered.
         recordings: an episode's pictures with the joint log, by camera; empty for masks.
@@ -103,6 +106,9 @@ class RegistrationInputs:
     known_cameras: tuple[Camera, ...] = ()
     searched_cameras: tuple[PinholeCamera, ...] = ()
     given_cameras: tuple[PinholeCamera, ...] = ()
+    links: Mapping[str, str] = field(default_factory=dict)
+    given_on_links: tuple[PinholeCamera, ...] = ()
+    riding: Mapping[str, RegistrationError] = field(default_factory=dict)
     assumed_focal: frozenset[str] = frozenset()
     left_out: tuple[str, ...] = ()
     recordings: Mapping[str, Recording] = field(default_factory=dict)
@@ -113,7 +119,7 @@ class RegistrationInputs:
     target: CalibrationTarget | None = None
     offset_joints: tuple[str, ...] = ()
     scaled_links: tuple[str, ...] = ()
-    mapped: MappedJoints | None = None
+    mapped: JointLog | None = None
     lenses: Mapping[str, Lens] = field(default_factory=dict)
 
     @property
@@ -152,6 +158,17 @@ class RegistrationInputs:
         ]
         left_out = tuple(dict.fromkeys((*self.left_out, *cameras)))
         return replace(self, frames=tuple(k for k in frames if k.masks), left_out=left_out)
+
+    def of_cameras(self, cameras: Collection[str]) -> "RegistrationInputs":
+        """Return an episode's inputs with some of its searched cameras alone, by name."""
+        searched = tuple(one for one in self.searched_cameras if one.name in cameras)
+        return replace(
+            self,
+            scene=replace(self.scene, cameras={one.name: one for one in searched}),
+            searched_cameras=searched,
+            given_cameras=tuple(one for one in self.given_cameras if one.name in cameras),
+            recordings={name: one for name, one in self.recordings.items() if name in cameras},
+        )
 
     def with_values(self, values: Iterable[Array]) -> tuple[MultiViewFrame, ...]:
         """Return `frames` at other values (m,) of the tree, one array for each frame."""
@@ -198,7 +215,7 @@ def read_inputs(
     robot = read_robot(model, settings)
     own = scene / JOINT_TABLE
     if isinstance(settings, RegistrationSettings):
-        joints = joints or _own_joints(scene, robot, settings)
+        joints = joints or own_joints(scene, robot, settings)
         inputs = _read_masks(scene, robot, joints, cameras, settings)
         if joints is None and own.is_file():
             text = (
@@ -236,42 +253,20 @@ def read_inputs(
     )
 
 
-def still_joints(inputs: RegistrationInputs, moves: float = 0.2, least: int = 3) -> tuple[str, ...]:
-    """Return what may be wrong with an episode's log if its pictures are refused.
+def on_link(
+    inputs: RegistrationInputs, camera: str, settings: AuditSettings
+) -> tuple[RegistrationInputs, RegistrationSettings]:
+    """Return inputs and settings of a camera of an episode that rides on a link, see `links`.
 
-    These are revolute joints that read the same in all rows, as of an encoder that is stuck.
-
-    Args:
-        inputs: the episode; those of a scene of masks have no log.
-        moves: minimum range of the readings of joints that move [rad or m].
-        least: minimum number of such joints.
+    Raises DrakePoseError: as `read_inputs`.
     """
-    if inputs.mapped is None:
-        return ()
-    log, model = inputs.mapped.log, inputs.model
-    ranges = np.fmax.reduce(log.positions, axis=0) - np.fmin.reduce(log.positions, axis=0)
-    if np.count_nonzero(ranges > moves) < least:
-        return ()
-    return tuple(
-        f"joint '{name}' reads {log.positions[0, k]:.4g} in all rows of the log, while others "
-        "move: does its encoder work?"
-        for k, name in enumerate(log.names)
-        if ranges[k] == 0.0 and model.position_kinds[model.position_index(name)] == "angle"
+    common = {one.name: getattr(settings, one.name) for one in fields(AuditSettings)}
+    focal = isinstance(settings, RegistrationSettings) and settings.focal
+    own = RegistrationSettings(
+        **{**common, "cameras": (camera,)}, on=inputs.links[camera], focal=focal
     )
-
-
-def _own_joints(scene: Path, robot: ArticulatedModel, settings: AuditSettings) -> Path | None:
-    """Return the scene's joint table; None: it has no table with all joints that are not held."""
-    path = scene / JOINT_TABLE
-    if not path.is_file():
-        return None
-    try:
-        known = {*read_measured_positions(path, robot.position_names).names}
-    except UnknownNameError:  # The table belongs to another model.
-        return None
-    tree = make_tree(robot, EstimateSettings(hold=settings.hold))
-    held = {robot.position_names[index] for index in tree.held}
-    return path if {*TreeKinematics(tree).names} <= known | held else None
+    path, model = inputs.scene.path, inputs.model.path
+    return read_inputs(path, model, inputs.joints, inputs.cameras, own), own
 
 
 def _read_episode(
@@ -292,24 +287,27 @@ def _read_episode(
         tree = make_tree(robot, EstimateSettings(hold=settings.hold))
     mapped = map_log(path, episode.joints, tree, settings)
     warnings = [*episode.warnings, *robot.warnings, *mapped.warnings]
-    if mapped.unposed:
+    posed = posed_nodes(tree, mapped)
+    unposed = [node.name for node in tree.nodes if node.name not in posed]
+    if unposed:
         warnings.append(
             "these parts are not used, as a joint that moves them is not logged: "
-            f"{', '.join(mapped.unposed)}; hold joints that do not move (--hold NAME=VALUE, [deg "
+            f"{', '.join(unposed)}; hold joints that do not move (--hold NAME=VALUE, [deg "
             "or m])"
         )
     chosen, placed, read = cameras_of(episode, cameras, settings)
     known = {camera.name: camera.pinhole() for camera in chosen}
+    links = {one.name: one.link for one in chosen if one.link in robot.link_names}
     kinematics = TreeKinematics(tree)
-    default = kinematics.flatten(tree.default_values())
     inputs = RegistrationInputs(
         Scene(path, known, (), {}), robot, tree, KnownPositions(path, kinematics, {}),
         joints, cameras, (*warnings, *read), searched_cameras=tuple(known.values()),
         given_cameras=tuple(one for name, one in known.items() if name in placed),
+        links=links, given_on_links=tuple(known[name] for name in links),
         assumed_focal=frozenset(camera.name for camera in chosen if camera.camera is None),
-        recordings={one.name: _recording(one, mapped, default, settings) for one in chosen},
-        visible_nodes=standing or (mapped.posed if mapped.unposed else None),
-        target=target, mapped=mapped.mapped,
+        recordings={one.name: _recording(one, mapped, kinematics, settings) for one in chosen},
+        visible_nodes=standing or (posed if unposed else None),
+        target=target, mapped=mapped,
         lenses={camera.name: camera.lens for camera in chosen if camera.lens is not None},
     )  # fmt: skip
     if not isinstance(settings, RegistrationSettings):
@@ -325,7 +323,7 @@ def _read_episode(
             f"--zeros with --on takes one camera, but {path} has {', '.join(known)}: name the one "
             f"on link '{settings.on}' (--camera NAME)"
         )
-    if scene_alone and standing is not None and not {*standing} <= {*mapped.posed}:
+    if scene_alone and standing is not None and not {*standing} <= {*posed}:
         raise SceneError(
             f"{path}: joints between the base and link '{settings.on}' are not logged, so its pose "
             "is not known: give a joint map (--joint-map FILE), or hold those that do not move "
@@ -336,22 +334,24 @@ def _read_episode(
 
 
 def _recording(
-    camera: EpisodeCamera, mapped: TreeLog, default: Array, settings: AuditSettings
+    camera: Stream, mapped: JointLog, kinematics: TreeKinematics, settings: AuditSettings
 ) -> Recording:
     """Return the pictures of a camera's selected frames, with the joint log.
 
     Args:
         camera: the episode's camera.
-        mapped: the joint log, with the columns of the tree's values.
-        default: (m,) the tree's values; logged values replace theirs [rad or m].
+        mapped: the joint log, in values of the tree.
+        kinematics: of the tree, with the default values of those that the log lacks.
         settings: select the frames.
     """
     kept = kept_pictures(camera, settings)
+    default = kinematics.flatten(kinematics.tree.default_values())
+    asked = [kinematics.names.index(name) for name in mapped.names]
 
     def values_at(offset: float | Array) -> Array:
         """Return the tree's values (n, m) at a time offset [s], see ``Recording``."""
         values = np.tile(default, (len(kept), 1))
-        values[:, mapped.asked] = rows_of(mapped.log, camera, kept, np.asarray(offset))
+        values[:, asked] = rows_of(mapped, camera, kept, np.asarray(offset))
         return values
 
     # A search reads the same few dozen pictures repeatedly.
@@ -359,8 +359,8 @@ def _recording(
     def read(k: int) -> Picture:
         return camera.read(int(kept[k]))
 
-    names = tuple(frames_of(camera)[k] for k in kept)
-    times = camera.times[kept] if is_timed(mapped.log, camera) else None
+    names = tuple(camera.names[k] for k in kept)
+    times = camera.times[kept] if is_timed(mapped, camera) else None
     return Recording(names, values_at, read, times)
 
 
@@ -387,7 +387,7 @@ def _read_masks(
     searched, held = _select_cameras(scene, file, settings)
     table, target = None, read_target(robot, settings)
     if joints is not None and target is None:
-        table = read_measured_positions(joints, robot.position_names)
+        table = read_measured_positions(joints, robot)
     if joints is None or (table is not None and table.is_estimate):
         # Estimated positions would absorb these parameters.
         for name in ("zeros", "lengths", "focal", "on"):
@@ -396,7 +396,7 @@ def _read_masks(
                     f"--{name} needs measured joint positions (--joints FILE): estimated ones "
                     "would absorb what it asks for"
                 )
-    if table is not None and table.bases:
+    if table is not None and table.bases is not None and len(table.bases):
         robot, table = put_on_base(robot, table)
     tree, visible = make_registration_tree(robot, settings, target)
     kinematics = TreeKinematics(tree)

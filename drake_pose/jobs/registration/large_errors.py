@@ -102,8 +102,7 @@ class SceneComparison:
     ) -> None:
         self._inputs, self._on_frame = inputs, on_frame
         self.body = RegistrationBody(inputs.tree, inputs.visible_nodes)
-        names = evenly_spaced(inputs.audited_frames, sample_size)
-        sample = [inputs.read(name) for name in names]
+        sample = map(inputs.read, evenly_spaced(inputs.audited_frames, sample_size))
         self._sample = [frame for frame in sample if frame.masks]
 
     def run(self, most: int = 3) -> SceneFit:
@@ -144,7 +143,7 @@ class SceneComparison:
         """
         given = self._inputs.known_cameras
         if (correction := self._search(given, [])) is not None:
-            finding = Finding("reading", correction.name, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+            finding = Finding("reading", correction.name)
             reread = self._compare(correction.cameras, (correction,))
             if not reread.is_doubtful:
                 return replace(reread, findings=(finding,), warnings=(f"as given, {why}",))
@@ -185,10 +184,8 @@ class SceneComparison:
             if again.inlier_ratio <= now.inlier_ratio:
                 break
             if not now.is_doubtful:
-                before, after = (
-                    now.joint_inlier_ratios[correction.name],
-                    again.joint_inlier_ratios[correction.name],
-                )
+                before = now.joint_inlier_ratios[correction.name]
+                after = again.joint_inlier_ratios[correction.name]
                 if LARGE.outlier_reduction * (1.0 - after) > 1.0 - before:
                     break
             now = self._record(now, again, correction)
@@ -229,8 +226,7 @@ class SceneComparison:
                     f"{percent(ratio)} of its outline fit in all frames, and other positions of "
                     "its joint do not improve that: is its shape the model's?"
                 )
-                shape = Finding("link", node, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, link=node, text=text)
-                findings.append(shape)
+                findings.append(Finding("link", node, link=node, text=text))
         moved, found = self._find_moved(now, found)
         wrong = next((finding for finding in findings if finding.kind in ("sign", "log")), None)
         if wrong is not None:
@@ -266,10 +262,7 @@ class SceneComparison:
                 given = [one for one in now.fit.cameras_at(now.at) if one.name in cameras]
                 placed = self._register(frames, given)
                 motions = [off for _, off in placed.values()]
-                base = base_motion(
-                    {camera.name: camera for camera in given},
-                    {k: one for k, (one, _) in placed.items()},
-                )
+                base = base_motion([(k, placed[k.name][0]) for k in given if k.name in placed])
                 if base is not None and len(placed) == len(cameras):
                     motions = [replace(base, pixels=motions[0].pixels)]
             when = "since then" if found.frames[-1].finding is not None else "until then"
@@ -451,11 +444,6 @@ class SceneComparison:
             findings = (*findings, finding)
         return replace(now, findings=findings, warnings=warnings)
 
-    def _turns(self, joint: str) -> bool:
-        """Return whether the positions of a joint, given by name, are angles."""
-        kinematics = self.body.kinematics
-        return bool(kinematics.is_angle[kinematics.names.index(joint)])
-
     def _differing(self, off: Finding, before: SceneFit, correction: Correction) -> Finding:
         """Return a finding with a joint's largest difference from its log, as number and in words.
 
@@ -466,7 +454,7 @@ class SceneComparison:
         frames = [before.corrected(frame) for frame in self._sample]
         logged = np.array([frame.values[j] for frame in frames])
         by = np.array([correction.apply(frame).values[j] for frame in frames]) - logged
-        turns = self._turns(correction.name)
+        turns = bool(self.body.kinematics.is_angle[j])
         unit, factor = ("degrees", 180.0 / np.pi) if turns else ("mm", 1e3)
         sizes = np.abs((by + np.pi) % (2.0 * np.pi) - np.pi if turns else by)
         text = f"it is {factor * sizes.min():.0f} to {factor * sizes.max():.0f} {unit} off"

@@ -3,14 +3,16 @@
 import json
 import math
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from drake_pose.camera.joint_map import MappedJoints, motors_of
+from drake_pose.camera.episode import JointLog
+from drake_pose.camera.joint_map import motors_of
 from drake_pose.camera.lerobot import INFO, camera_name
 from drake_pose.camera.lerobot_tables import camera_fields
 from drake_pose.camera.models import Camera, PinholeCamera
-from drake_pose.camera.servo_readings import HomingCorrection, correct_homing, dump_column
+from drake_pose.camera.servo_readings import Column, Encoding, JointReadings, Servos
 from drake_pose.errors import SettingsError
 from drake_pose.jobs.registration.inputs import RegistrationInputs
 
@@ -18,7 +20,83 @@ FOLDER = "lerobot"
 """Folder of these files in a result folder."""
 
 
-def require_data_set(inputs: RegistrationInputs) -> MappedJoints:
+@dataclass(frozen=True)
+class HomingCorrection:
+    """A motor's corrected homing offset."""
+
+    motor: str  # Name of the motor.
+    # before, after: homing offset in the file, and corrected [steps].
+    before: int
+    after: int
+    shift: int  # Increase of the motor's positions by the correction [steps].
+    reason: str = ""  # Why the offset is not corrected; "": it is.
+
+
+def correct_homing(
+    joint: JointReadings,
+    motor_name: str,
+    column: Column,
+    offset: float,
+    servos: Servos,
+    encoding: Encoding,
+    *,
+    most_lost: float = 0.5,
+) -> HomingCorrection:
+    """Return the homing offset with which LeRobot reads the model's angle of a joint.
+
+    The middle of the motor's range, where LeRobot reads 0, becomes the model's zero. The range's
+    numbers stay, so that its ends are the same angles on both sides of the zero.
+
+    Args:
+        joint: the joint; its readings are not used.
+        motor_name: name of the motor in the calibration file.
+        column: the joint's column, as recorded.
+        offset: the joint's offset, to be added to the recorded positions [rad].
+        servos: the robot's motors.
+        encoding: of the column's readings.
+        most_lost: maximum correction [half the range]; beyond it the model's zero is not meant to
+            be the motor's, as in a model whose limits are all on one side of 0.
+    """
+    motor, step = servos.motors[motor_name], 2.0 * math.pi / servos.turn
+    before = motor.homing
+    if joint.is_gripper:
+        reason = "its readings are an opening of 0 to 100, not an angle"
+        return HomingCorrection(motor_name, before, before, 0, reason)
+    sign = -1.0 if motor.is_inverted and not servos.is_dynamixel and encoding != "deg" else 1.0
+    if servos.has_lists:
+        # Calibrations by lists invert what the motor counts, then add the offset.
+        counted = sign if encoding == "steps" else 1.0
+        shift = round(math.copysign(offset / step, counted * column.scale * offset))
+        return HomingCorrection(motor_name, before, before + shift, shift)
+    middle = 0.5 * (motor.low + motor.high) if encoding == "steps" else 0.0
+    zero = column.scale * middle + column.offset + offset
+    shift, half = round(sign * zero / step), 0.5 * (motor.high - motor.low)
+    if abs(shift) > most_lost * half:
+        reason = (
+            f"the middle of its range is {math.degrees(zero):.0f} degrees in the model, too far "
+            "from its zero: calibrate it again with the arm in the middle of its range"
+        )
+        return HomingCorrection(motor_name, before, before, 0, reason)
+    # Feetech: position = counted - homing offset; Dynamixel: plus.
+    after = before + shift if servos.is_dynamixel else before - shift
+    if not servos.is_dynamixel and abs(after) >= servos.turn // 2:
+        # The register has a sign and 11 bits; positions are modulo a turn.
+        after = max(after - int(math.copysign(servos.turn, after)), 1 - servos.turn // 2)
+    return HomingCorrection(motor_name, before, after, shift)
+
+
+def dump_column(joint: str, column: Column, offset: float) -> str:
+    """Return a joint's line of a joint map, ``offset`` added to its positions [rad or m]."""
+    scale, constant = float(column.scale), float(column.offset + offset)
+    name = json.dumps(column.name)
+    if column.ends is None:
+        return f"{joint}: {{column: {name}, scale: {scale!r}, offset: {constant!r}}}\n"
+    ends = [float(end) for end in column.ends]
+    values = [scale * end + constant for end in ends]
+    return f"{joint}: {{column: {name}, from: {ends}, to: {values}}}\n"
+
+
+def require_data_set(inputs: RegistrationInputs) -> JointLog:
     """Return the mapped joint log of the LeRobot data set that is registered.
 
     Raises SettingsError: the recording is no LeRobot data set, or a joint table (--joints) is used.
@@ -35,15 +113,15 @@ def require_data_set(inputs: RegistrationInputs) -> MappedJoints:
 def lerobot_files(
     inputs: RegistrationInputs,
     cameras: Iterable[Camera],
-    link: str | None,
+    links: Mapping[str, str],
     zeros: Mapping[str, Mapping[str, Any]],
 ) -> tuple[dict[str, bytes | str], list[str]]:
     """Return a joint map, a corrected calibration of the motors, and a copy of `meta`.
 
     Args:
         inputs: the registration's inputs.
-        cameras: the cameras, with poses in the world, or in the link's frame.
-        link: the link that carries the cameras; None: they stand in the world.
+        cameras: the cameras, with poses in the world, or in a link's frame.
+        links: link of each camera that rides on one, by the camera's name.
         zeros: the summary's entries on joint offsets, by joint, see ``describe_parameters``.
 
     Returns:
@@ -61,7 +139,7 @@ def lerobot_files(
     lines = [dump_column(joint, one, offsets.get(joint, 0.0)) for joint, one in columns]
     files: dict[str, bytes | str] = {f"{FOLDER}/joint_map.yaml": "".join(lines)}
     corrections, notes = _corrections(mapped, offsets)
-    source = mapped.log.servos.path if mapped.log.servos else None
+    source = mapped.servos.path if mapped.servos else None
     if corrections and source is not None:
         content = json.loads(source.read_bytes())
         for entry in corrections:
@@ -83,7 +161,9 @@ def lerobot_files(
             key = next(k for k in info["features"] if camera.name in (k, camera_name(k)))
             feature = info["features"][key]
             written.add(key)
-            feature["info"] = (feature.get("info") or {}) | camera_fields(camera, link)
+            feature["info"] = (feature.get("info") or {}) | camera_fields(
+                camera, links.get(camera.name)
+            )
     for key in {*info["features"]} - written:
         named = camera_name(key)
         if named in inputs.left_out:
@@ -96,23 +176,23 @@ def lerobot_files(
             (info["features"][key].get("info") or {}).pop("camera_extrinsics", None)
     files[f"{FOLDER}/{INFO}"] = json.dumps(info, indent=4) + "\n"
     name = source.name if corrections and source is not None else None
-    files[f"{FOLDER}/README.md"] = _readme(path, name, corrections, offsets)
+    files[f"{FOLDER}/README.md"] = _readme(path, name, corrections, len(offsets))
     return files, notes
 
 
 def _corrections(
-    mapped: MappedJoints, offsets: Mapping[str, float]
+    mapped: JointLog, offsets: Mapping[str, float]
 ) -> tuple[list[HomingCorrection], list[str]]:
     """Return the motors' corrections for joint offsets, and warnings of motors left as they were.
 
     offsets: significant joint offsets by joint [rad or m].
     """
-    servos, none = mapped.log.servos, "--export lerobot: no calibration of the motors is written: "
+    servos, none = mapped.servos, "--export lerobot: no calibration of the motors is written: "
     if servos is None or servos.path is None:
         return [], [
             f"{none}the robot's own is not in or beside the data set; name it (--joint-map FILE)"
         ]
-    if mapped.encoding is None:
+    if mapped.unit in (None, "rad"):
         return [], [f"{none}the joint log holds angles or is mapped, not readings of motors"]
     if not (servos.is_so or servos.is_dynamixel):
         return [], [
@@ -123,7 +203,7 @@ def _corrections(
         return [], [f"{none}no joint offset is significant (--zeros all estimates them)"]
     corrections = [
         correct_homing(joint, motor, mapped.columns[joint.name],
-                       offsets.get(joint.name, 0.0), servos, mapped.encoding)
+                       offsets.get(joint.name, 0.0), servos, mapped.unit)
         for joint, motor in motors_of(mapped)
     ]  # fmt: skip
     kept = [f"{one.motor} ({one.reason})" for one in corrections if one.reason and one.motor]
@@ -132,10 +212,7 @@ def _corrections(
 
 
 def _readme(
-    path: Path,
-    calibration: str | None,
-    corrections: Iterable[HomingCorrection],
-    offsets: Mapping[str, float],
+    path: Path, calibration: str | None, corrections: Iterable[HomingCorrection], offset_count: int
 ) -> str:
     """Return a page that says what the files are, and how they are used.
 
@@ -143,14 +220,15 @@ def _readme(
         path: the data set.
         calibration: name of the corrected calibration file; None: it is not written.
         corrections: of the motors in that file.
-        offsets: significant joint offsets [rad or m].
+        offset_count: number of significant joint offsets.
     """
     text = f"""Found by `drake-pose register` in {path}, which is left as it was.
 
 - `joint_map.yaml` (`--joint-map joint_map.yaml`): from the columns of episodes of this calibration
-  to the model's joints [rad or m], {len(offsets)} joint offsets included.
+  to the model's joints [rad or m], {offset_count} joint offsets included.
 - `meta/`, in place of the data set's own: `info.json` has `camera_intrinsics` (matrix [pixel]) and
-  `camera_extrinsics` (4 x 4, camera in the robot's base [m]; x right, y down, z forward).
+  `camera_extrinsics` (4 x 4 [m]; x right, y down, z forward) of each camera, in the robot's base
+  or, if `camera_link` names a link, on that link.
 """
     if calibration is None:
         return text

@@ -23,20 +23,16 @@ from drake_pose.body import (
 from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.episode import JointLog
 from drake_pose.camera.episode_files import JOINT_TABLE
-from drake_pose.camera.joint_map import follower_warnings
 from drake_pose.camera.models import Camera
 from drake_pose.camera.picture_files import frame_key
-from drake_pose.camera.servo_readings import Column
-from drake_pose.errors import SceneError, SettingsError
+from drake_pose.errors import SceneError, SettingsError, UnknownNameError
 from drake_pose.files.records import base_pose
-from drake_pose.files.settings import EstimateSettings, RegistrationSettings
+from drake_pose.files.settings import AuditSettings, EstimateSettings, RegistrationSettings
 from drake_pose.fit.parameters import carried_joints
 from drake_pose.jobs.estimate.inputs import make_tree, missing_for_person
 from drake_pose.jobs.estimate.measurements import (
-    MeasuredPositions,
-    check_units,
-    followers_of,
     read_measured_positions,
+    with_leaders,
 )
 from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.person.pose_tracker import shape_parts
@@ -84,9 +80,7 @@ class KnownPositions:
         return bool((np.ptp(np.array(list(rows)), axis=0) < same).all())
 
 
-def put_on_base(
-    model: ArticulatedModel, table: MeasuredPositions
-) -> tuple[ArticulatedModel, MeasuredPositions]:
+def put_on_base(model: ArticulatedModel, table: JointLog) -> tuple[ArticulatedModel, JointLog]:
     """Return a model whose base moves on BASE_JOINTS, and a table with positions of these joints.
 
     These positions are 0 at the base pose of the table's first frame.
@@ -95,24 +89,22 @@ def put_on_base(
 
     Raises ModelError: the model is no URDF.
     """
-    X_WB = {frame: base_pose(base) for frame, base in table.bases.items()}
-    first = next(iter(X_WB.values()))
+    X_WB = [base_pose(base) for base in (() if table.bases is None else table.bases)]
+    first = X_WB[0]
     moved = model.with_base_joints(first)
     kept = [k for k, name in enumerate(table.names) if name in moved.position_names]
-    values = {}
-    for frame, X in X_WB.items():
-        turns = Rotation.from_matrix(X[:3, :3] @ first[:3, :3].T).as_euler("ZYX")
-        place = X[:3, 3] - first[:3, 3]
-        values[frame] = np.concatenate([table.values[frame][kept], place, turns])
+    turns = [Rotation.from_matrix(X[:3, :3] @ first[:3, :3].T).as_euler("ZYX") for X in X_WB]
+    places = [X[:3, 3] - first[:3, 3] for X in X_WB]
     names = (*(table.names[k] for k in kept), *BASE_JOINTS)
-    return moved, MeasuredPositions(table.path, names, values, is_estimate=table.is_estimate)
+    positions = np.column_stack([table.positions[:, kept], places, turns])
+    return moved, replace(table, names=names, positions=positions, bases=None)
 
 
 def read_known_positions(
     path: Path,
     kinematics: TreeKinematics,
     unobserved: bool = False,
-    table: MeasuredPositions | None = None,
+    table: JointLog | None = None,
 ) -> KnownPositions:
     """Return the positions in a table with columns for the frame and each joint that is not held.
 
@@ -125,11 +117,12 @@ def read_known_positions(
     Raises SceneError: the table cannot be read, lacks a joint, has an unusable column, or is not in
     radians and metres; UnknownNameError: the model has no joint of a column's name.
     """
-    model = kinematics.tree.model
-    table = table or read_measured_positions(path, model.position_names)
+    model, followers = kinematics.tree.model, kinematics.tree.followers
+    table = table or read_measured_positions(path, model)
+    q, couplings, warnings = with_leaders(model, followers, table.names, table.positions)
     held = {model.position_names[index] for index in kinematics.tree.held}
     needed = [name for name in kinematics.names if name not in held]
-    missing = [name for name in needed if name not in table.names]
+    missing = [name for name in needed if name not in {*table.names, *couplings}]
     if missing:
         raise SceneError(
             f"{path}: has no column for joint{'s' if len(missing) > 1 else ''} "
@@ -139,13 +132,12 @@ def read_known_positions(
         )
     # Columns of joints that move no visible part, and of followers, are ignored.
     known = {*needed, *kinematics.tree.unobserved_positions} if unobserved else set(needed)
-    followers = followers_of(kinematics.tree)
-    known |= {*followers}
+    known |= {model.position_names[one.follower] for one in followers}
     for column, name in enumerate(table.names if table.is_estimate else ()):
         # An estimate has columns of held positions, too; they must have the held values.
         index = model.position_index(name)
         usual = kinematics.tree.held.get(index, model.default_positions[index])
-        if all(abs(row[column] - usual) < 1e-6 for row in table.values.values()):
+        if all(abs(row[column] - usual) < 1e-6 for row in table.positions):
             known.add(name)
     unused = [name for name in table.names if name not in known]
     if unused:
@@ -154,17 +146,54 @@ def read_known_positions(
             "robot in the world. Cameras are registered with the robot placed as in its model "
             "file: leave the column out"
         )
-    columns = [table.names.index(name) if name in needed else -1 for name in kinematics.names]
-    is_held = np.array(columns) < 0
-    rows = table.values.items()
-    values = {k: np.where(is_held, kinematics.lower, row[columns]) for k, row in rows}
-    warnings = check_units(path, model, kinematics.names, values)
-    columns_of = {name: Column(name) for name in needed}
-    rows_of_table = np.array([*table.values.values()]).reshape(-1, len(table.names))
-    log = JointLog(table.names, None, rows_of_table)
-    ranges = dict(zip(kinematics.names, kinematics.upper - kinematics.lower, strict=True))
-    warnings += tuple(follower_warnings(log, columns_of, followers, ranges))
-    return KnownPositions(path, kinematics, values, table.is_estimate, warnings)
+    values = np.tile(kinematics.lower, (len(q), 1))
+    for k, name in enumerate(kinematics.names):
+        if name in needed:
+            values[:, k] = q[:, model.position_index(name)]
+    of_frame = dict(zip(table.by_frame, values, strict=True))
+    texts = (*table.warnings, *warnings)
+    return KnownPositions(path, kinematics, of_frame, table.is_estimate, texts)
+
+
+def own_joints(scene: Path, robot: ArticulatedModel, settings: AuditSettings) -> Path | None:
+    """Return the scene's joint table; None: it has no table with all joints that are not held."""
+    path = scene / JOINT_TABLE
+    if not path.is_file():
+        return None
+    try:
+        table = read_measured_positions(path, robot)
+    except UnknownNameError:  # The table belongs to another model.
+        return None
+    tree = make_tree(robot, EstimateSettings(hold=settings.hold))
+    held = {robot.position_names[index] for index in tree.held}
+    leaders = with_leaders(robot, tree.followers, table.names, table.positions)[1]
+    return path if {*TreeKinematics(tree).names} <= {*table.names, *leaders} | held else None
+
+
+def still_joints(
+    log: JointLog | None, model: ArticulatedModel, moves: float = 0.2, least: int = 3
+) -> tuple[str, ...]:
+    """Return what may be wrong with an episode's log if its pictures are refused.
+
+    These are revolute joints that read the same in all rows, as of an encoder that is stuck.
+
+    Args:
+        log: the log in the model's joints; None: there is none.
+        model: the robot.
+        moves: minimum range of the readings of joints that move [rad or m].
+        least: minimum number of such joints.
+    """
+    rows = np.zeros((1, 0)) if log is None else log.positions
+    ranges = np.fmax.reduce(rows, axis=0) - np.fmin.reduce(rows, axis=0)
+    if log is None or np.count_nonzero(ranges > moves) < least:
+        return ()
+    return tuple(
+        f"joint '{name}' reads {rows[0, k]:.4g} in all rows of the log, while others move: does "
+        "its encoder work?"
+        for k, name in enumerate(log.names)
+        if ranges[k] == 0.0 and name in log.columns
+        if model.position_kinds[model.position_index(name)] == "angle"
+    )
 
 
 def estimate_positions(

@@ -5,7 +5,6 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import combinations, product
-from operator import methodcaller
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -58,45 +57,62 @@ def scene_corrections(
     def with_row(rows: Mapping[str, Array], frame: MultiViewFrame) -> MultiViewFrame:
         return replace(frame, values=rows[frame.name])
 
+    of_name = {camera.name: camera for camera in cameras}
+    # All cameras, then each camera alone if there are several.
+    groups = [[*of_name], *([name] for name in of_name if len(of_name) > 1)]
     for reading in readings():
         # Those of a misread rotation and a second mistake are for `likeliest_reading` alone.
-        for group in () if reading.is_turned and reading.steps > 1 else _groups(cameras):
-            reread = [
-                camera.with_pose(reading.meant(camera.X_WC)) if camera.name in group else camera
-                for camera in cameras
-            ]
+        for group in () if reading.is_turned and reading.steps > 1 else groups:
+            reread = {k: of_name[k].with_pose(reading.meant(of_name[k].X_WC)) for k in group}
             whose = "every X_WC" if len(group) > 1 else f"X_WC of camera '{group[0]}'"
-            text = f"{whose} seems to be {reading.text}"
             rank = reading.steps + 1 - len(group)
-            yield Correction("reading", text, tuple(reread), unchanged, 0.0, rank)
-    for a, b in list(combinations(range(len(cameras)), 2))[:pairs]:
-        swapped = list(cameras)
-        swapped[a] = cameras[a].with_pose(cameras[b].X_WC)
-        swapped[b] = cameras[b].with_pose(cameras[a].X_WC)
-        text = f"cameras '{cameras[a].name}' and '{cameras[b].name}' seem to be exchanged"
-        yield Correction("reading", text, tuple(swapped), unchanged)
-        sizes_of = [(cameras[k].width, cameras[k].height) for k in (a, b)]
-        if sizes_of[0] == sizes_of[1]:
+            text = f"{whose} seems to be {reading.text}"
+            yield Correction("reading", text, _changed(cameras, reread), unchanged, 0.0, rank)
+    for a, b in list(combinations(cameras, 2))[:pairs]:
+        text = f"cameras '{a.name}' and '{b.name}' seem to be exchanged"
+        swapped: dict[str, Camera] = {a.name: a.with_pose(b.X_WC), b.name: b.with_pose(a.X_WC)}
+        yield Correction("reading", text, _changed(cameras, swapped), unchanged)
+        if (a.width, a.height) == (b.width, b.height):
             # The same with their intrinsics: the folders of masks were exchanged.
-            swapped[a] = replace(cameras[b], name=cameras[a].name)
-            swapped[b] = replace(cameras[a], name=cameras[b].name)
-            yield Correction("reading", text, tuple(swapped), unchanged)
-    for group in _groups(cameras):
+            swapped = {a.name: replace(b, name=a.name), b.name: replace(a, name=b.name)}
+            yield Correction("reading", text, _changed(cameras, swapped), unchanged)
+    for group in groups:
         whose = "all cameras" if len(group) > 1 else f"camera '{group[0]}'"
         text = f"the masks of {whose}: {MIRRORED}"
         yield Correction("reading", text, tuple(cameras), partial(mirrored, group))
-        if not all(isinstance(camera, PinholeCamera) for camera in cameras if camera.name in group):
+        own = [one for k in group if isinstance(one := of_name[k], PinholeCamera)]
+        if len(own) < len(group):
             continue
-        text = "focal lengths" if len(cameras) > 1 and len(group) > 1 else "focal length of camera"
-        text += "" if len(group) > 1 else f" '{group[0]}'"
+        text = "focal lengths" if len(group) > 1 else f"focal length of {whose}"
         for factor in focal:
-            yield focal_correction(cameras, group, text, factor)
-        yield from _intrinsics_corrections(cameras, group, sizes)
+            longer = {
+                one.name: replace(one, focal_x=factor * one.focal_x, focal_y=factor * one.focal_y)
+                for one in own
+            }
+            fitted = tuple(f"{name}.{CAMERA_NAMES[6]}" for name in group)
+            changed, amount = _changed(cameras, longer), float(np.log(factor))
+            yield Correction("focal", text, changed, unchanged, amount, 1.0, fitted)
+        for size in sizes:
+            scaled = {k.name: k.with_scaled_intrinsics(1.0 / size, 1.0 / size) for k in own}
+            shape = f"{size * own[0].width:.0f} x {size * own[0].height:.0f} pixels"
+            text = (
+                f"the intrinsics of {whose} seem to be those of pictures of {shape}: divide focal "
+                f"lengths and principal point by {size:.4g}"
+            )
+            yield Correction("reading", text, _changed(cameras, scaled), unchanged)
+        exchanged = {k.name: replace(k, center_x=k.center_y, center_y=k.center_x) for k in own}
+        text = f"center_x and center_y of {whose} seem to be exchanged"
+        yield Correction("reading", text, _changed(cameras, exchanged), unchanged)
     for text, rows in other_rows(values):
         shifted = dict(zip(frames, rows, strict=True))
         yield Correction(
             "reading", f"the masks: {text}", tuple(cameras), partial(with_row, shifted)
         )
+
+
+def _changed(cameras: Sequence[Camera], changed: Mapping[str, Camera]) -> tuple[Camera, ...]:
+    """Return the cameras with some of them, by name, replaced."""
+    return tuple(changed.get(camera.name, camera) for camera in cameras)
 
 
 def other_rows(rows: Sequence[T]) -> Iterator[tuple[str, list[T]]]:
@@ -162,63 +178,6 @@ def shift_correction(
             texts.append(f"to that of camera '{camera.name}' add {x:.0f}, {y:.0f} px")
     text = f"principal points seem to be off, or cameras turned: {'; '.join(texts)}"
     return Correction("reading", text, tuple(shifted), unchanged) if texts else None
-
-
-def _intrinsics_corrections(
-    cameras: Sequence[Camera], group: Collection[str], sizes: Sequence[float]
-) -> Iterator[Correction]:
-    """Yield corrections of the intrinsics of the cameras in `group`, names of pinhole cameras.
-
-    The intrinsics may be those of pictures of other `sizes` [size of the camera's pictures], or
-    the principal point's coordinates may be exchanged.
-    """
-    whose = "all cameras" if len(group) > 1 else f"camera '{next(iter(group))}'"
-
-    def changed(change: Callable[[PinholeCamera], PinholeCamera]) -> tuple[Camera, ...]:
-        return tuple(
-            change(one) if isinstance(one, PinholeCamera) and one.name in group else one
-            for one in cameras
-        )
-
-    for size in sizes:
-        first = next(one for one in cameras if one.name in group)
-        scaled = methodcaller("with_scaled_intrinsics", 1.0 / size, 1.0 / size)
-        shape = f"{size * first.width:.0f} x {size * first.height:.0f} pixels"
-        text = (
-            f"the intrinsics of {whose} seem to be those of pictures of {shape}: divide focal "
-            f"lengths and principal point by {size:.4g}"
-        )
-        yield Correction("reading", text, changed(scaled), unchanged)
-    text = f"center_x and center_y of {whose} seem to be exchanged"
-    exchanged = changed(lambda one: replace(one, center_x=one.center_y, center_y=one.center_x))
-    yield Correction("reading", text, exchanged, unchanged)
-
-
-def focal_correction(
-    cameras: Sequence[Camera], group: Collection[str], text: str, factor: float
-) -> Correction:
-    """Return a correction that multiplies focal lengths by a factor.
-
-    Args:
-        cameras: all cameras.
-        group: names of the pinhole cameras that are corrected.
-        text: the correction's name.
-        factor: of the focal lengths.
-    """
-    changed = tuple(
-        replace(camera, focal_x=factor * camera.focal_x, focal_y=factor * camera.focal_y)
-        if isinstance(camera, PinholeCamera) and camera.name in group
-        else camera
-        for camera in cameras
-    )
-    fitted = tuple(f"{name}.{CAMERA_NAMES[6]}" for name in group)
-    return Correction("focal", text, changed, unchanged, float(np.log(factor)), 1.0, fitted)
-
-
-def _groups(cameras: Sequence[Camera]) -> list[tuple[str, ...]]:
-    """Return groups of cameras' names: all cameras, then each camera alone if there are several."""
-    names = tuple(camera.name for camera in cameras)
-    return [names, *((name,) for name in names if len(names) > 1)]
 
 
 class Reading(NamedTuple):

@@ -1,7 +1,7 @@
 """Register the cameras of a scene or an episode."""
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,7 +12,7 @@ import numpy as np
 from drake_pose.arrays import Array, Picture
 from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import Camera, PinholeCamera
-from drake_pose.errors import CameraError, RegistrationError, noted_warnings
+from drake_pose.errors import RegistrationError, noted_warnings
 from drake_pose.files.folder import write_file, writes_folder
 from drake_pose.files.settings import RegistrationSettings
 from drake_pose.jobs.estimate.inputs import missing_for_person
@@ -24,26 +24,35 @@ from drake_pose.jobs.registration.diagnosis import (
     require_determined,
     require_explained,
 )
-from drake_pose.jobs.registration.inputs import RegistrationInputs, read_inputs, still_joints
+from drake_pose.jobs.registration.inputs import (
+    RegistrationInputs,
+    read_inputs,
+)
 from drake_pose.jobs.registration.lerobot_files import lerobot_files, require_data_set
+from drake_pose.jobs.registration.pages import compared_frames
 from drake_pose.jobs.registration.positions import (
     corrected_urdf,
     joint_shifts,
     make_registration_tree,
+    still_joints,
 )
 from drake_pose.jobs.registration.result import (
-    check_exports,
-    compared_frames,
     describe_camera,
     describe_parameters,
     describe_run,
+    export_texts,
     write_result,
 )
 from drake_pose.jobs.registration.tracks import (
+    by_link,
+    describe_given,
     describe_pictures,
     describe_tracks,
     draw_tracks,
+    find_in_pictures,
+    given_on_link,
     picture_warnings,
+    register_on_link,
     register_recordings,
     say_refused,
     track_warnings,
@@ -52,6 +61,8 @@ from drake_pose.jobs.registration.tracks import (
 from drake_pose.jobs.registration.words import (
     common_outlier_warnings,
     few_frames_warning,
+    fit_of_inliers,
+    frames_of_other_rows,
     likely_offset_warnings,
     lost_frames_warning,
     mode_warnings,
@@ -66,8 +77,7 @@ from drake_pose.registration.joint_offsets import calibrate_joints
 from drake_pose.registration.per_frame_fit import adjust_bundle
 from drake_pose.registration.picture_acceptance import PictureRegistration, evaluate_pictures
 from drake_pose.registration.picture_registration import offsets_in_pictures
-from drake_pose.registration.posed_frames import MultiViewFrame, PosedFrame, PosedFrames
-from drake_pose.registration.recording import choose_pictures, posed_pictures
+from drake_pose.registration.posed_frames import MultiViewFrame, PosedFrames
 from drake_pose.registration.register import (
     CameraSearch,
     E_total,
@@ -80,17 +90,12 @@ from drake_pose.registration.register import (
 from drake_pose.registration.standing_object import (
     CalibrationTarget,
     TargetSearch,
-    find_target_frames,
     require_detections,
 )
-from drake_pose.registration.track_registration import (
-    TrackRegistration,
-    register_tracks,
-)
+from drake_pose.registration.track_registration import TrackRegistration
 from drake_pose.workers import use_workers
 
-OnCamera = Callable[[int], None]
-"""Called with the number of cameras that are done."""
+OnCamera = Callable[[int], None]  # Called with the number of cameras that are done.
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +129,7 @@ def register_scene(
     *,
     cameras: Path | str | None = None,
     overlay: bool = True,
-    on_camera: OnCamera | None = None,
+    on_camera: OnCamera = lambda _: None,
 ) -> SceneRegistration:
     """Estimate the poses of a scene's or an episode's cameras, without an initial guess.
 
@@ -152,50 +157,60 @@ def register_scene(
         inputs = read_inputs(Path(scene), Path(model), table, file, settings)
         if settings.on is None:
             inputs = watch_cameras(inputs)
-        noted += (*inputs.warnings, *still_joints(inputs))
-        work = _Registration(inputs, settings, on_camera)
-        check_exports(settings.exports, [*inputs.known_cameras, *inputs.searched_cameras])
+        noted += (*inputs.warnings, *still_joints(inputs.mapped, inputs.model))
+        # Refuse exports that could not be written before any work.
+        every: list[Camera] = [*inputs.known_cameras, *inputs.searched_cameras]
+        export_texts(settings.exports, every, "world", {})
         if "lerobot" in settings.exports:
             require_data_set(inputs)
-        work.find()
-        start = time.perf_counter()
-        if work.inputs.positions.is_estimate:
-            work.refit_poses()
-        urdf = work.fit_constants(folder) if work.has_constants else None
-        work.check_focal_lengths()
-        work.evaluate()
-        described = work.describe((time.perf_counter() - start) / len(work.registered))
-    refused = {name: say_refused(why) for name, why in work.refused.items()}
-    work.warnings += [f"left out: {why}" for why in refused.values()]
+        refused, works, groups = {**inputs.riding}, list[_Registration](), by_link(inputs, settings)
+        for part, its_settings in groups:
+            work = _Registration(part, its_settings, on_camera)
+            try:
+                work.run(folder)
+            except RegistrationError as error:
+                if len(groups) == 1 and not refused:
+                    raise
+                refused |= {one.name: error for one in part.searched_cameras} | work.refused
+            else:
+                works.append(work)
+        if not works:
+            raise next(iter(refused.values()))
+        works[0].refused |= refused
+    work, files = works[0], dict[str, bytes | str]()
+    registered = {name: one for own in works for name, one in own.registered.items()}
+    reasons = {name: say_refused(why) for own in works for name, why in own.refused.items()}
+    warnings = [*dict.fromkeys(sum((own.warnings for own in works), [*inputs.warnings]))]
+    warnings += [f"left out: {why}" for why in reasons.values()]
     placed = {
-        name: work.registered[name].camera if name in work.registered else camera
-        for name, camera in work.inputs.scene.cameras.items()
-        if name not in work.inputs.left_out
+        name: registered[name].camera if name in registered else camera
+        for name, camera in inputs.scene.cameras.items()
+        if name in registered or name not in {*work.inputs.left_out, *reasons}
     }
-    files: Mapping[str, bytes | str] = {}
+    links = {name: own.link for own in works for name in own.registered if own.link is not None}
     if "lerobot" in settings.exports:
+        asked = replace(inputs, left_out=(*work.inputs.left_out, *reasons))
         zeros = work.parameters["zeros"]
-        files, texts = lerobot_files(work.inputs, placed.values(), settings.on, zeros)
-        work.warnings += texts
+        files, texts = lerobot_files(asked, placed.values(), links, zeros)
+        warnings += texts
+    described = {name: one for own in works for name, one in own.described.items()}
     seconds = sum(entry["seconds"] for entry in described.values())
     summary = {
         # A single camera's part is also at the top level.
-        **(next(iter(described.values())) if len(described) == 1 and not refused else {}),
-        **describe_run(inputs, settings, work.warnings, seconds),
+        **(next(iter(described.values())) if len(described) == 1 and not reasons else {}),
+        **describe_run(inputs, settings, warnings, seconds),
         "cameras": described,
-        "refused": refused,
+        "refused": reasons,
     }
     if folder is not None:
         for name, content in files.items():
             write_file(folder, name, content)
-        for result in work.tracks.values() if overlay else ():
-            draw_tracks(folder, result)
-        overlay = overlay and not work.tracks
-        write_result(
-            folder, work.inputs, placed, work.registered, summary, overlay, urdf, work.shown
-        )
-    warnings = tuple(work.warnings)
-    return SceneRegistration(placed, work.registered, summary, warnings, folder, refused)
+        for own in works if overlay else ():
+            for name, result in own.tracks.items():
+                draw_tracks(folder, result, given_on_link(own.inputs, name, own.link))
+        shown = work.target_pictures | {k: one.pictures for k, one in work.pictures.items()}
+        write_result(folder, work.inputs, placed, registered, summary, overlay, work.urdf, shown)
+    return SceneRegistration(placed, registered, summary, tuple(warnings), folder, reasons)
 
 
 class _Registration:
@@ -210,10 +225,13 @@ class _Registration:
         target_pictures: by camera and frame, pictures in which the target was found.
         tracks: registrations of cameras on a link from a standing scene, by camera.
         refused: by camera the reason why it has no pose.
+        link: the link that carries the cameras, if any.
+        described: by camera its part of summary.json, after `run`.
+        urdf: text of the robot with corrected constants, after `run`; None: nothing is corrected.
     """
 
     def __init__(
-        self, inputs: RegistrationInputs, settings: RegistrationSettings, on_camera: OnCamera | None
+        self, inputs: RegistrationInputs, settings: RegistrationSettings, on_camera: OnCamera
     ) -> None:
         self.inputs, self._settings, self._on_camera = inputs, settings, on_camera
         self.body = RegistrationBody(
@@ -228,12 +246,9 @@ class _Registration:
         self.target_pictures = dict[str, dict[str, Picture]]()
         self.tracks = dict[str, TrackRegistration]()
         self.refused = dict[str, RegistrationError]()
+        self.link, self.described = settings.on, dict[str, dict[str, Any]]()
+        self.urdf: bytes | None = None
         self._joint_offsets = np.zeros(len(self.body.kinematics.names))
-
-    @property
-    def shown(self) -> dict[str, dict[str, Picture]]:
-        """Pictures (H, W, 3) by camera and frame name, of cameras registered from pictures."""
-        return self.target_pictures | {name: one.pictures for name, one in self.pictures.items()}
 
     @property
     def has_constants(self) -> bool:
@@ -243,6 +258,26 @@ class _Registration:
         several = self.inputs.target is not None and len(self.registered) > 1
         focal = settings.focal and not self.pictures
         return bool(settings.zeros or settings.lengths or focal or several)
+
+    def run(self, folder: Path | None) -> None:
+        """Register and evaluate the cameras; folder: of the result, see `fit_constants`.
+
+        Raises RegistrationError: see `find` and `evaluate`.
+        """
+        self.find()
+        start = time.perf_counter()
+        if self.inputs.positions.is_estimate:
+            self.refit_poses()
+        self.urdf = self.fit_constants(folder) if self.has_constants else None
+        self.check_focal_lengths()
+        self.evaluate()
+        more = (time.perf_counter() - start) / len(self.registered)
+        for name, camera in self.registered.items():
+            how = describe_pictures(self.pictures.get(name), name in self.target_pictures)
+            if name in self.tracks:
+                how = describe_tracks(self.tracks[name], self.body.kinematics)
+            own = describe_camera(camera, self.seconds[name] + more, self.link)
+            self.described[name] = self.parameters | own | how
 
     def find(self) -> None:
         """Register each camera by itself, from masks or from pictures.
@@ -260,16 +295,14 @@ class _Registration:
             self._find_target(inputs.target)
         elif (link := self._settings.on) is not None:
             # From things that stand still in the pictures.
-            base = inputs.tree.node_index((inputs.visible_nodes or ())[0])
             for camera in inputs.searched_cameras:
                 name, start = camera.name, time.perf_counter()
-                assumed = name in inputs.assumed_focal
                 with self._refusing(name):
-                    found = self.tracks[name] = register_tracks(
-                        self.body, link, base, camera, inputs.recordings[name],
-                        self._settings.focal or assumed, inputs.offset_joints,
-                    )  # fmt: skip
-                    self.warnings += track_warnings(found, assumed)
+                    found = register_on_link(inputs, self._settings, camera)
+                    self.tracks[name] = found
+                    self.warnings += track_warnings(found, name in inputs.assumed_focal)
+                    given = given_on_link(inputs, name, link)
+                    self.warnings += [] if given is None else [describe_given(found, given)]
                     self._note(found.found, start)
         else:
             frames, start = list[MultiViewFrame](), time.perf_counter()
@@ -345,40 +378,23 @@ class _Registration:
         name = found.camera.name
         self.registered[name] = found
         self.seconds[name] = time.perf_counter() - start
-        if self._on_camera is not None:
-            self._on_camera(len(self.registered))
+        self._on_camera(len(self.registered))
 
-    def _find_target(self, target: CalibrationTarget, most: int = 24) -> None:
+    def _find_target(self, target: CalibrationTarget) -> None:
         """Find the target in some pictures of each camera, and register the cameras from them.
-
-        target: the calibration target. most: maximum number of pictures of each camera.
 
         Raises CameraError: a camera's focal length is unknown.
         """
         inputs, frames, start = self.inputs, list[MultiViewFrame](), time.perf_counter()
-        body = target.body(np.eye(4))
         for camera in inputs.searched_cameras:
             name = camera.name
-            if name in inputs.assumed_focal:
-                raise CameraError(
-                    f"camera '{name}': its focal length is unknown, but pictures of a target "
-                    "determine a distance only with it; calibrate the camera"
-                )
-            recording = inputs.recordings[name]
-            rows, _ = choose_pictures(body, camera, recording, most)
-            segmented: Sequence[PosedFrame] = ()
             with self._refusing(name):
-                segmented = find_target_frames(target, camera, posed_pictures(recording, rows, 0.0))
-            if name in self.refused:
-                continue
-            self.target_pictures[name] = {
-                frame.name: recording.picture(frame.name) for frame in segmented
-            }
-            frames += [MultiViewFrame.alone(name, frame) for frame in segmented]
-            found_names = self.target_pictures[name]
-            lost = [recording.names[k] for k in rows if recording.names[k] not in found_names]
-            if lost:
-                self.warnings.append(lost_frames_warning(name, lost, recording.names, "target"))
+                segmented, lost = find_in_pictures(target, inputs, camera)
+                names = [frame.name for frame in segmented]
+                recording = inputs.recordings[name]
+                self.target_pictures[name] = {k: recording.picture(k) for k in names}
+                frames += [MultiViewFrame.alone(name, frame) for frame in segmented]
+                self.warnings += lost
         self.inputs = replace(inputs, frames=tuple(frames))
         seconds = time.perf_counter() - start
         self._find_each()
@@ -402,10 +418,11 @@ class _Registration:
             if picture is not None:
                 fitted = replace(found, frames=picture.found.frames)
                 posed = [replace(k, values=k.values + self._joint_offsets) for k in picture.frames]
-            if not self._settings.zeros:
-                self.warnings += likely_offset_warnings(body, fitted, posed)
-            if inputs.target is None:
-                self.warnings += odd_link_warnings(body, fitted, posed, self._settings.without)
+            inliers = fit_of_inliers(body, fitted, posed)
+            if inliers is not None and not self._settings.zeros:
+                self.warnings += likely_offset_warnings(body, name, inliers)
+            if inliers is not None and inputs.target is None:
+                self.warnings += odd_link_warnings(body, name, inliers, self._settings.without)
             if self._settings.focal or (picture is not None and picture.focal_deviation):
                 continue
             checked, deviation, texts = check_focal_length(body, fitted, posed)
@@ -448,13 +465,16 @@ class _Registration:
                 self.warnings.append(lost_frames_warning(name, lost, recording.names))
         if frames:
             inputs = self.inputs = replace(inputs, frames=tuple(frames))
+        misplaced = dict[str, list[str]]()
         before, joint = len(self.refused), self.has_constants or inputs.positions.is_estimate
         for name, found in list(self.registered.items()):
             from_pictures = name in {**self.pictures, **self.target_pictures, **self.tracks}
             with self._refusing(name):
                 if inputs.target is not None:
                     require_determined(found)
-                self.warnings += outlier_warnings(found, from_pictures)
+                own = inputs.of(name) if name not in self.tracks else []
+                misplaced[name] = frames_of_other_rows(body, found, own)
+                self.warnings += outlier_warnings(found, from_pictures, misplaced[name])
                 self.warnings += mode_warnings(body, found, inputs.of(name))
                 if not inputs.offset_joints and self._settings.on is None:
                     self.warnings += zero_warnings(body, found, inputs.of(name))
@@ -462,41 +482,31 @@ class _Registration:
             raise list(self.refused.values())[before]
         self._require_registered()
         self.warnings += common_outlier_warnings(
-            self.registered.values(), from_pictures=bool(self.pictures)
+            self.registered.values(),
+            from_pictures=bool(self.pictures),
+            misplaced={frame for own in misplaced.values() for frame in own},
         )
-
-    def describe(self, more: float) -> dict[str, dict[str, Any]]:
-        """Return each camera's part of summary.json; more: added to each camera's duration [s]."""
-        return {
-            name: self.parameters
-            | describe_camera(camera, self.seconds[name] + more, self._settings.on)
-            | (
-                describe_tracks(self.tracks[name], self.body.kinematics)
-                if name in self.tracks
-                else describe_pictures(self.pictures.get(name), name in self.target_pictures)
-            )
-            for name, camera in self.registered.items()
-        }
 
     def refit_poses(self) -> None:
         """Fit cameras, estimated positions and the body's shape together (bundle adjustment).
 
-        Cameras registered with estimated positions have these positions' errors, too.
+        Cameras registered with estimated positions have these positions' errors, too. Masks of a
+        camera's outlier frames are left out. A person's shape is fitted.
 
         Raises RegistrationError: no pose of a camera explains its masks.
         """
-        inputs, registered = self.inputs, self.registered
-        wrong = {name: found.outliers for name, found in registered.items()}
-        frames = []
+        inputs = self.inputs
+        kinematics, agreeing = self.body.kinematics, list[MultiViewFrame]()
+        wrong = {name: found.outliers for name, found in self.registered.items()}
         for frame in inputs.frames:
-            agree = {c: m for c, m in frame.masks.items() if frame.name not in wrong.get(c, ())}
-            frames.append(replace(frame, masks=agree))
-        cameras = [*self._known_cameras, *(found.camera for found in registered.values())]
-        shape: tuple[Any, ...] = (np.zeros(len(self.body.kinematics.names), np.bool_),)
+            masks = {c: m for c, m in frame.masks.items() if frame.name not in wrong.get(c, ())}
+            agreeing.append(replace(frame, masks=masks))
+        cameras = [*self._known_cameras, *(found.camera for found in self.registered.values())]
+        shape: tuple[Any, ...] = (np.zeros(len(kinematics.names), np.bool_),)
         if not missing_for_person(inputs.model):
-            shape = (shape_values(inputs.tree), *shape_parts(inputs.tree))
+            shape = (shape_values(self.body.tree), *shape_parts(self.body.tree))
         adjusted, covariances, values, radius_scales = adjust_bundle(
-            self.body.kinematics, self.body.medium, cameras, registered, frames, *shape
+            kinematics, self.body.medium, cameras, self.registered, agreeing, *shape
         )
         self.inputs = replace(inputs, frames=inputs.with_values(values))
         known = inputs.positions.radius_scales

@@ -1,9 +1,9 @@
 """Write the results of a registration: cameras, overlays, summary, report and exports."""
 
 import math
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import yaml
@@ -20,34 +20,26 @@ from drake_pose.camera.exchange import (
     ros_transforms,
 )
 from drake_pose.camera.models import Camera
-from drake_pose.errors import listed
-from drake_pose.files.folder import OVERLAY, REPORT, without_nan, write_file, write_summary
-from drake_pose.files.overlay import draw_overlay, draw_shapes, encode_png
-from drake_pose.files.records import describe_job, file_digest, versions
-from drake_pose.files.report_page import new_plot, overlay_picture, page_template, plot_uri
+from drake_pose.files.folder import AS_GIVEN, OVERLAY, without_nan, write_file, write_summary
+from drake_pose.files.overlay import body_drawer, draw_overlay, draw_shapes, encode_png
+from drake_pose.files.records import describe_job, describe_warnings, file_digest, versions
 from drake_pose.files.settings import AuditSettings, percent
 from drake_pose.input_files import csv_text
 from drake_pose.jobs.registration.inputs import RegistrationInputs
-from drake_pose.jobs.registration.words import describe_reading
+from drake_pose.jobs.registration.pages import compared_frames, registration_page
+from drake_pose.registration.findings import Diagnosis, Finding
 from drake_pose.registration.joint_offsets import KinematicParameter
 from drake_pose.registration.posed_frames import PosedFrame
 from drake_pose.registration.register import (
     RegisteredCamera,
     TargetPose,
 )
-from drake_pose.silhouette.outline import outline_from_mesh
 from drake_pose.silhouette.pictures.masks import encode_mask
 from drake_pose.silhouette.pictures.scenes import CAMERA_FILE
-from drake_pose.silhouette.scoring import draw_labels
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 
 def describe_camera(
-    found: RegisteredCamera,
-    seconds: float,
-    link: str | None = None,
+    found: RegisteredCamera, seconds: float, link: str | None = None
 ) -> dict[str, Any]:
     """Return a camera's part of summary.json; lengths in m unless `_mm`, angles in `_deg`.
 
@@ -137,7 +129,7 @@ def describe_run(
     job["sha256"]["joints"] = joints and file_digest(joints)
     return {
         "seconds": seconds,
-        "warnings": list(warnings),
+        **describe_warnings(warnings),
         "cameras": str(inputs.camera_file),
         "joints": joints and str(joints),
         **job,
@@ -155,7 +147,7 @@ def write_result(
     urdf: bytes | None,
     pictures: Mapping[str, Mapping[str, Picture]],
 ) -> None:
-    """Write the result folder; the camera file is written last.
+    """Write the result folder.
 
     Args:
         path: the folder.
@@ -172,6 +164,8 @@ def write_result(
     """
     parts = summary["cameras"]
     for name, found in registered.items() if overlay else ():
+        if not inputs.of(name):  # A camera registered from a standing scene has no silhouettes.
+            continue
         titles = [
             f"{name}  frame {frame.frame}  E_total {percent(frame.E_total)}  IoU {frame.iou:.2f}  "
             f"{'agrees' if frame.is_inlier else 'OUTLIER'}"
@@ -214,11 +208,11 @@ def write_result(
         )
     write_file(path, "registration.yaml", yaml.safe_dump(described, sort_keys=False))
     write_summary(path, summary)
-    write_file(path, REPORT, make_registration_report(path, summary))
     links = {name: part["link"] for name, part in parts.items() if "link" in part}
     formats = summary["settings"]["exports"]
     write_exports(path, formats, inputs, cameras.values(), links)
     write_file(path, CAMERA_FILE, dump_cameras(cameras, links))
+    registration_page(path, summary).write(path)
 
 
 def write_overlays(
@@ -241,7 +235,7 @@ def write_overlays(
     """
     draw = body_drawer(tree, visible_nodes)
     for frame, title in titled:
-        segments = draw(camera, frame)
+        segments = draw(camera, frame.values)
         shown: NDArray[Any] = pictures.get(frame.name, frame.mask)
         picture = draw_overlay(shown, segments >= 0, segments, title)
         write_file(folder, f"{OVERLAY}/{camera.name}/{frame.name}.png", encode_png(picture))
@@ -269,191 +263,51 @@ def write_comparisons(
     draw = body_drawer(inputs.tree, inputs.visible_nodes)
     errors = {frame.frame: frame.E_total for frame in found.frames}
     for frame in (frame for frame in frames if frame.name in compared_frames(errors)):
-        shown: NDArray[Any] = pictures.get(frame.name, frame.mask)
-        bodies = [draw(camera, frame) >= 0 for camera in (given, found.camera)]
-        names = ("the camera as given", "as found")
-        picture = draw_shapes(shown, bodies, names, f"{given.name}  frame {frame.name}")
+        bodies = [draw(camera, frame.values) >= 0 for camera in (given, found.camera)]
+        names, title = ("the camera as given", "as found"), f"{given.name}  frame {frame.name}"
+        picture = draw_shapes(pictures.get(frame.name, frame.mask), bodies, names, title)
         write_file(folder, f"{AS_GIVEN}/{given.name}/{frame.name}.png", encode_png(picture))
 
 
-def body_drawer(
-    tree: PoseTree, visible_nodes: Collection[str] | None
-) -> Callable[[Camera, PosedFrame], NDArray[np.intp]]:
-    """Return a function that draws the body as seen by a camera, at the values of a frame.
+def write_corrections(
+    folder: Path, inputs: RegistrationInputs, found: Diagnosis, most: int = 8
+) -> None:
+    """Draw the robot as given and as found by an audit, if joints were corrected.
 
-    The drawing (H, W) has for each pixel the index of the drawn node that it shows, or -1.
-
-    visible_nodes: names of the nodes that are drawn; None: all.
+    At most ``most`` frames are drawn into the folder AS_GIVEN, the largest errors first.
     """
-    kinematics, names = TreeKinematics(tree), visible_nodes
-    shown = [k for k, node in enumerate(tree.nodes) if names is None or node.name in names]
-    outlines = [outline_from_mesh(tree.nodes[k].mesh) for k in shown]
-
-    def draw(camera: Camera, frame: PosedFrame) -> NDArray[np.intp]:
-        X_CN = camera.X_CW @ kinematics.poses(frame.values)[shown]
-        labels = draw_labels(outlines, np.arange(1, len(shown) + 1), X_CN, camera)
-        return np.asarray(labels, np.intp) - 1
-
-    return draw
-
-
-AS_GIVEN = "overlay_as_given"
-"""Folder of pictures that compare given and registered camera poses."""
-
-# Number of pictures of each camera in the report, from the worst to the best frame.
-_PICTURES = 6
-PARAMETERS = (
-    ("zeros", "Joint offsets, to be added to positions", "joint", "offset"),
-    ("lengths", "Link scales, relative changes of length", "link", "change"),
-)
-"""Of each kind of parameter: its key in the summary, a title, who has it, and what it is."""
-
-NORMAL = 1.96
-"""Half-width of a 95 % interval in standard deviations."""
-
-
-def parameter_rows(parameters: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, ...]]:
-    """Return rows of the report's table of joint offsets or link scales.
-
-    parameters: entries by joint or link, see `describe_parameters`.
-
-    A row has the name, the value with its unit, the 95 % interval, and its significance in words.
-    """
-    rows: list[tuple[str, ...]] = []
-    for name, entry in parameters.items():
-        if not entry["determined"]:
-            gauge = f", correlated with {', '.join(entry['gauge'])}" if entry["gauge"] else ""
-            rows.append((name, "", "", f"not determined{gauge}"))
+    names, count = TreeKinematics(inputs.tree).names, 0
+    draw = body_drawer(inputs.tree, inputs.visible_nodes)
+    shown = [one for one in found.frames if one.frame in inputs.scene.frames]
+    for frame in sorted(shown, key=lambda one: -one.pixels):
+        own = [] if frame.finding is None or frame.finding in found.common else [frame.finding]
+        seen = inputs.read(frame.frame)
+        values = seen.values
+        for finding in (*found.common, *own):
+            values = corrected(values, names, finding)
+        if np.array_equal(values, seen.values) or count == most:
             continue
-        key = next(key for key in entry if key.startswith("value_"))
-        unit = key.removeprefix("value_")
-        value = f"{entry[key]:.2f} {'%' if unit == 'percent' else unit}"
-        interval = f"{entry[f'low_{unit}']:.2f} to {entry[f'high_{unit}']:.2f}"
-        within = entry[f"low_{unit}"] <= 0.0 <= entry[f"high_{unit}"]
-        word = "0 is in its interval" if within else "not significant at 5 % over all parameters"
-        word = "significant" if entry["significant"] else f"{word}: not written into the URDF"
-        if entry["significant"] and unit != "percent":
-            word += f": {describe_reading(entry[key], entry[f'sd_{unit}'], unit)}"
-        rows.append((name, value, interval, word))
-    return rows
+        count += 1
+        for camera in (one for one in inputs.known_cameras if one.name in seen.masks):
+            name, mask = camera.name, seen.masks[camera.name]
+            bodies = [draw(camera, one) >= 0 for one in (seen.values, values)]
+            title = f"{name}  frame {frame.frame}"
+            picture = draw_shapes(mask, bodies, ("as given", "as found"), title)
+            write_file(folder, f"{AS_GIVEN}/{name}/{frame.frame}.png", encode_png(picture))
 
 
-def make_registration_report(folder: Path, summary: Mapping[str, Any]) -> str:
-    """Return the text of report.html, with the overlays in the result folder.
+def corrected(values: Array, names: Sequence[str], finding: Finding) -> Array:
+    """Return the joint values (m,) corrected by a finding; unchanged if it corrects no joint.
 
-    summary: content of summary.json.
+    ``values``: (m,) joint values [rad or m]. ``names``: (m,) names of the joints. ``finding``: its
+    kind and joints tell the correction.
     """
-    # The robot's parameters are the same in the parts of all cameras.
-    first = next(iter(summary["cameras"].values()))
-    pictures, pairs = [], []
-    for camera, entry in summary["cameras"].items():
-        # Overlays are shown from the worst frame to the best.
-        # Frames without a silhouette are ordered by the fraction of points that do not fit.
-        errors = {
-            frame: 1.0 - part["inlier_ratio"] if part["E_total"] is None else part["E_total"]
-            for frame, part in entry["frames"].items()
-        }
-        shown = (
-            frame for frame in errors if (folder / OVERLAY / camera / f"{frame}.png").is_file()
-        )
-        in_order = sorted(shown, key=lambda frame: -errors[frame])
-        count = min(_PICTURES, len(in_order))
-        for k in np.linspace(0, len(in_order) - 1, count).round().astype(int):
-            frame = in_order[k]
-            pictures.append(overlay_picture(folder, camera, frame, errors[frame]))
-        for frame in compared_frames(errors):
-            pairs.append(overlay_picture(folder, camera, frame, errors[frame], AS_GIVEN))
-    figures = [(name, plot_offset(one)) for name, one in summary["cameras"].items()]
-    return page_template("drake_pose.jobs.registration").render(
-        summary=summary,
-        answer=registration_answer(summary["cameras"], summary.get("refused", ())),
-        kind="camera poses",
-        title=Path(str(summary["scene"])).name or str(summary["scene"]),
-        model=Path(str(summary["model"])).name,
-        target=first.get("target"),
-        parameters=[
-            (title, of, what, parameter_rows(first[key]))
-            for key, title, of, what in PARAMETERS
-            if first[key]
-        ],
-        by_pictures=first["masks"] == "found",
-        by_points=first["masks"] == "none",
-        # Cameras that see a target have no time offset.
-        clocks=first["masks"] == "found" and "time_offset_scores" in first,
-        offsets={name: figure and plot_uri(figure) for name, figure in figures},
-        normal=NORMAL,
-        pictures=[picture for picture in pictures if picture is not None],
-        pairs=[picture for picture in pairs if picture is not None],
-    )
-
-
-def registration_answer(cameras: Mapping[str, Mapping[str, Any]], refused: Collection[str]) -> str:
-    """Return the result in a few sentences.
-
-    Args:
-        cameras: the parts of summary.json by camera.
-        refused: names of cameras without an accepted pose.
-    """
-    parts = list(cameras.values())
-    shift, turn = (
-        max(part[key] for part in parts) for key in ("translation_sd_mm", "rotation_sd_deg")
-    )
-    outliers = sum(len(part["outliers"]) for part in parts)
-    count = sum(len(part["frames"]) for part in parts)
-    what = "frame" if len(parts) == 1 else "picture" if parts[0]["masks"] == "found" else "mask"
-    words = "Camera found" if len(parts) == 1 else f"{len(parts)} cameras found"
-    up_to = "" if len(parts) == 1 else "up to "
-    texts = [f"{words}, with a standard deviation of {up_to}{shift:.1f} mm and {turn:.2f} deg."]
-    if refused:
-        texts.insert(0, f"{len(refused)} refused, see the warnings: {listed([*refused])}.")
-    are = "is an outlier" if outliers == 1 else "are outliers"
-    texts.append(f"{outliers} of {count} {what}s {are}.")
-    if ambiguous := [name for name, camera in cameras.items() if len(camera["modes"]) > 1]:
-        texts.append(f"Other poses fit equally well: {listed(ambiguous)}.")
-    for key, name in (("zeros", "joint offsets"), ("lengths", "link scales")):
-        if found := parts[0][key]:
-            significant = sum(one["significant"] for one in found.values())
-            texts.append(f"{significant} of {len(found)} {name} are significant.")
-    return " ".join(texts)
-
-
-def compared_frames(errors: Mapping[str, float]) -> Sequence[str]:
-    """Return the frames that are drawn to compare camera poses: the worst, and the median one.
-
-    errors: E_total by frame; at least one.
-    """
-    in_order = sorted(errors, key=lambda frame: -errors[frame])
-    return tuple(dict.fromkeys([in_order[0], in_order[len(in_order) // 2]]))
-
-
-def plot_offset(camera: Mapping[str, Any]) -> "Figure | None":
-    """Plot the scores of scanned time offsets; None: there are none.
-
-    A vertical line marks the estimated offset, in its 95 % interval.
-
-    camera: its part of summary.json.
-    """
-    tried = np.array(camera.get("time_offset_scores") or ()).reshape(-1, 2)
-    if len(tried) < 2:
-        return None
-    figure, axes = new_plot()
-    axes.plot(1e3 * tried[:, 0], 100.0 * tried[:, 1], marker=".", markersize=3)
-    if camera["time_offset_s"] is not None:
-        value, margin = 1e3 * camera["time_offset_s"], 1e3 * NORMAL * camera["time_offset_sd_s"]
-        axes.axvspan(value - margin, value + margin, color="#c5dfee")
-        axes.axvline(value, color="#d55e00")
-        axes.set_xlim(1e3 * tried[0, 0], 1e3 * tried[-1, 0])
-    return figure
-
-
-def check_exports(formats: Collection[str], cameras: Iterable[Camera]) -> None:
-    """Refuse exports that could not be written, before any work.
-
-    formats: of ``RegistrationSettings.exports``; "lerobot" is ignored here.
-
-    Raises CameraError: a format does not support a camera.
-    """
-    _texts(formats, list(cameras), "world", {})
+    added = dict(finding.joints)
+    if finding.kind == "joint":
+        added = {finding.name: finding.angle if finding.angle_sd > 0.0 else finding.shift}
+    elif finding.kind == "sign" and finding.name in names and "to be added" not in finding.text:
+        added = {finding.name: -2.0 * values[names.index(finding.name)]}
+    return values + [added.get(name, 0.0) for name in names]
 
 
 def write_exports(
@@ -482,17 +336,20 @@ def write_exports(
         if node.parent < 0 and not node.value_names and np.allclose(X_WN, np.eye(4), atol=1e-6):
             world = node.name
             break
-    for name, text in _texts(formats, cameras, world, links).items():
+    for name, text in export_texts(formats, cameras, world, links).items():
         write_file(folder, name, text)
 
 
-def _texts(
+def export_texts(
     formats: Collection[str], cameras: list[Camera], world: str, links: Mapping[str, str]
 ) -> dict[str, str]:
     """Return the texts of exports by path in the result folder.
 
-    formats: of the exports. cameras: as of `write_exports`. world: frame of cameras on no link.
-    links: by name of each other camera, its link.
+    formats: of ``RegistrationSettings.exports``; "lerobot" is ignored here. cameras: as of
+    `write_exports`. world: frame of cameras on no link. links: by name of each other camera, its
+    link.
+
+    Raises CameraError: a format does not support a camera.
     """
     texts: dict[str, str] = {}
     if "ros" in formats:
@@ -500,7 +357,7 @@ def _texts(
         frames = {camera.name: links.get(camera.name, world) for camera in cameras}
         texts["ros/static_transforms.launch.xml"] = ros_transforms(cameras, frames)
     if "mujoco" in formats:
-        texts["mujoco.xml"] = mujoco_cameras(cameras)
+        texts["mujoco.xml"] = mujoco_cameras(cameras, links)
     if "drake" in formats:
         texts["drake.yaml"] = dump_scenario(cameras, links)
     return texts

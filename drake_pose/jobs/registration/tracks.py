@@ -2,45 +2,87 @@
 
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+import yaml
+from scipy.special import chdtrc
 
 from drake_pose.arrays import Array
 from drake_pose.body.tree_kinematics import TreeKinematics
+from drake_pose.camera.camera_files import dump_cameras
 from drake_pose.camera.models import PinholeCamera
-from drake_pose.errors import RegistrationError, listed
+from drake_pose.errors import CameraError, RegistrationError, listed, weighted
 from drake_pose.files.folder import OVERLAY, write_file
 from drake_pose.files.overlay import EXCESS_RGB, encode_png
-from drake_pose.jobs.registration.inputs import RegistrationInputs
-from drake_pose.jobs.registration.result import describe_parameters
-from drake_pose.jobs.registration.words import describe_drift
+from drake_pose.files.settings import RegistrationSettings
+from drake_pose.jobs.registration.inputs import RegistrationInputs, on_link
+from drake_pose.jobs.registration.result import AS_GIVEN, describe_parameters, describe_pose
+from drake_pose.jobs.registration.words import (
+    describe_drift,
+    describe_error,
+    lost_frames_warning,
+)
 from drake_pose.registration.camera_motion import PictureMotion, find_camera_motion
+from drake_pose.registration.diagnosis import DIAGNOSIS
+from drake_pose.registration.findings import Finding
+from drake_pose.registration.online_registration import pose_difference, squared_distance
 from drake_pose.registration.picture_acceptance import PictureRegistration, PictureStart
 from drake_pose.registration.picture_registration import (
     fit_pictures,
     register_pictures,
 )
 from drake_pose.registration.picture_search import rotation_between
-from drake_pose.registration.recording import Recording
+from drake_pose.registration.posed_frames import PosedFrame
+from drake_pose.registration.recording import Recording, choose_pictures, posed_pictures
 from drake_pose.registration.register import RegistrationBody, evenly_spaced
 from drake_pose.registration.shared_fit import SHARED
-from drake_pose.registration.track_registration import TrackRegistration
+from drake_pose.registration.standing_object import CalibrationTarget, find_target_frames
+from drake_pose.registration.track_registration import (
+    TrackRegistration,
+    carrying_links,
+    register_tracks,
+)
 
 
-def watch_cameras(inputs: RegistrationInputs) -> RegistrationInputs:
+def watch_cameras(inputs: RegistrationInputs, often: float = 0.5) -> RegistrationInputs:
     """Return an episode's inputs with its cameras' motions, and warnings of drift and shake.
 
-    A scene of masks is returned as it is.
+    A camera whose background moves with one link of the robot, and is not given on another, is
+    added to `links`. A scene of masks is returned as it is.
+
+    often: where a larger fraction of a picture's corners is found again, the camera stands still.
+
+    Raises RegistrationError: as ``carrying_links``.
     """
-    motions, warnings = dict[str, PictureMotion](), list[str]()
+    motions, links, warnings = dict[str, PictureMotion](), {**inputs.links}, list[str]()
+    refused = dict[str, RegistrationError]()
     for camera in inputs.searched_cameras if inputs.recordings else ():
-        recording = inputs.recordings[camera.name]
+        name, recording = camera.name, inputs.recordings[camera.name]
+        if name in links:
+            continue
         motion = find_camera_motion(recording.read, len(recording.names), camera)
-        motions[camera.name] = motion
+        motions[name] = motion
+        carrying = tuple[str, ...]()
+        if motion.found_again < often:
+            body = RegistrationBody(inputs.tree, inputs.visible_nodes)
+            with suppress(RegistrationError):
+                carrying = carrying_links(body, camera, recording)
+        if len(carrying) == 1:
+            links |= {name: carrying[0]}
+            warnings.append(
+                f"camera '{name}' moves with the robot: its background moves as from link "
+                f"'{carrying[0]}', on which it was registered (--on {carrying[0]} --camera {name} "
+                "does so without a search)"
+            )
+            continue
+        if carrying or motion.found_again < LOST:
+            refused[name] = RegistrationError(_say_riding(inputs, name, carrying))
+            continue
         for pixels, what, how in (
             (motion.drift, "drifts", "shifts slowly"),
             (motion.shake, "shakes", "shifts from picture to picture"),
@@ -52,7 +94,32 @@ def watch_cameras(inputs: RegistrationInputs) -> RegistrationInputs:
                     f"a turn by {degrees:.2f} degrees or the like; the pose found is a mean; fix "
                     "the camera, or give fewer pictures (--frame)"
                 )
-    return replace(inputs, motions=motions, warnings=(*inputs.warnings, *warnings))
+    warnings = [*inputs.warnings, *warnings]
+    return replace(inputs, motions=motions, links=links, riding=refused, warnings=tuple(warnings))
+
+
+LOST = 0.05
+"""Where a smaller fraction of a picture's corners is found in others, the camera is moved."""
+
+
+def _say_riding(inputs: RegistrationInputs, name: str, carrying: Sequence[str]) -> str:
+    """Return why a camera that moves with the robot is not registered.
+
+    name: of the camera. carrying: names of the links that may carry it; (): any that moves may.
+    """
+    kinematics = TreeKinematics(inputs.tree)
+    moving = [one.name for one in inputs.tree.nodes[1:] if one.parent >= 0]
+    named = carrying or moving or kinematics.names
+    why = (
+        "its pictures do not tell them apart"
+        if carrying
+        else ("too little is found again in its pictures to tell which")
+    )
+    return (
+        f"camera '{name}' moves with the robot: next to nothing of its background stays where it "
+        f"is. It rides on link {' or '.join(named)}; {why}: name it (--on LINK --camera {name}). "
+        "Nothing was written"
+    )
 
 
 def turn_of(camera: PinholeCamera, pixels: float) -> float:
@@ -193,13 +260,14 @@ def picture_warnings(result: PictureRegistration | TrackRegistration, assumed: b
 
     assumed: whether the focal length was not given.
     """
-    name, focal, texts = result.found.camera.name, result.found.camera.focal_x, []
+    name, focal, texts = result.found.camera.name, result.found.camera.focal_x, list[str]()
     if assumed:
-        texts.append(
+        text = (
             f"camera '{name}': no focal length is given: it was estimated as "
             f"{focal:.0f} pixels (standard deviation {result.focal_deviation * focal:.0f}); give "
             "it in the camera file if it is known"
         )
+        texts.append(weighted(text, "note"))
     clock = result.time_offset
     if clock is not None and clock.drift:
         texts.append(describe_drift(name, clock.drift, clock.drift_deviation))
@@ -247,10 +315,115 @@ def track_warnings(result: TrackRegistration, assumed: bool) -> list[str]:
     return texts
 
 
-def draw_tracks(folder: Path, result: TrackRegistration, most: int = 6) -> None:
+def register_on_link(
+    inputs: RegistrationInputs, settings: RegistrationSettings, camera: PinholeCamera
+) -> TrackRegistration:
+    """Register a camera on the link ``settings.on`` from things that stand still in its pictures.
+
+    Raises RegistrationError: as ``register_tracks``.
+    """
+    body = RegistrationBody(inputs.tree, inputs.visible_nodes)
+    base = inputs.tree.node_index((inputs.visible_nodes or ())[0])
+    focal = settings.focal or camera.name in inputs.assumed_focal
+    recording = inputs.recordings[camera.name]
+    return register_tracks(
+        body, settings.on or "", base, camera, recording, focal, inputs.offset_joints
+    )
+
+
+def describe_on_link(result: TrackRegistration, link: str) -> dict[str, Any]:
+    """Return the part of an audit's summary.json on a camera that rides on a link."""
+    found = result.found
+    return {
+        "link": link,
+        **describe_lens_and_clock(result),
+        **describe_pose("X_LC", found.camera.X_WC, found),
+        "explained": result.explained,
+        "camera": yaml.safe_load(dump_cameras([found.camera], {found.camera.name: link}))[
+            found.camera.name
+        ],
+        "covariance": found.covariance.tolist(),
+    }
+
+
+def by_link(
+    inputs: RegistrationInputs, settings: RegistrationSettings
+) -> list[tuple[RegistrationInputs, RegistrationSettings]]:
+    """Return inputs and settings of the cameras that stand still, and of each that rides on a link.
+
+    Cameras of `riding` are left out. With ``settings.on`` all are on that link.
+
+    Raises DrakePoseError: as ``on_link``.
+    """
+    if settings.on is not None or not (inputs.links or inputs.riding):
+        return [(inputs, settings)]
+    moving = {*inputs.links, *inputs.riding}
+    standing = [one.name for one in inputs.searched_cameras if one.name not in moving]
+    groups = [(inputs.of_cameras(standing), settings)] if standing else []
+    return groups + [on_link(inputs, name, settings) for name in inputs.links]
+
+
+def find_in_pictures(
+    target: CalibrationTarget, inputs: RegistrationInputs, camera: PinholeCamera, most: int = 24
+) -> tuple[Sequence[PosedFrame], list[str]]:
+    """Return frames of a camera with the target's silhouettes, and a warning of lost pictures.
+
+    most: maximum number of pictures in which the target is sought.
+
+    Raises CameraError: the focal length is unknown; RegistrationError: as ``find_target_frames``.
+    """
+    name, recording = camera.name, inputs.recordings[camera.name]
+    if name in inputs.assumed_focal:
+        raise CameraError(
+            f"camera '{name}': its focal length is unknown, but pictures of a target determine a "
+            "distance only with it; calibrate the camera"
+        )
+    rows, _ = choose_pictures(target.body(np.eye(4)), camera, recording, most)
+    frames = find_target_frames(target, camera, posed_pictures(recording, rows, 0.0))
+    found = {frame.name for frame in frames}
+    lost = [recording.names[k] for k in rows if recording.names[k] not in found]
+    return frames, [lost_frames_warning(name, lost, recording.names, "target")] if lost else []
+
+
+def given_on_link(
+    inputs: RegistrationInputs, camera: str, link: str | None
+) -> PinholeCamera | None:
+    """Return a camera, by name, as given on a link; None: no X_LC on this link is given."""
+    is_given = inputs.links.get(camera) == link
+    return next((k for k in inputs.given_on_links if is_given and k.name == camera), None)
+
+
+def compare_on_link(result: TrackRegistration, given: PinholeCamera) -> Finding:
+    """Return the difference of a given pose on a link from the registered one as a finding."""
+    found, shifts = result.found, result.points_in(given) - result.points_in(result.found.camera)
+    difference = pose_difference(found.camera.X_WC, given.X_WC)
+    return Finding(
+        "camera", given.name, float(np.linalg.norm(difference[:3])),
+        float(np.linalg.norm(difference[3:])), found.rotation_sd, found.translation_sd,
+        float(np.sqrt(np.nanmedian((shifts**2).sum(axis=1)))),
+        float(chdtrc(len(difference), squared_distance(difference, found.covariance))),
+    )  # fmt: skip
+
+
+def describe_given(result: TrackRegistration, given: PinholeCamera) -> str:
+    """Return in words how far a camera's given pose on its link is from the registered one."""
+    off = compare_on_link(result, given)
+    differs = "and found differ" if off.p_value <= DIAGNOSIS.significance else "is as found"
+    return f"as given {differs}: {describe_error(off, 'is off')}, by {off.pixels:.1f} pixels"
+
+
+def draw_tracks(
+    folder: Path,
+    result: TrackRegistration,
+    given: PinholeCamera | None = None,
+    most: int = 6,
+    prefix: str = "",
+) -> None:
     """Draw inlier points in blue and outliers in orange, in up to `most` pictures.
 
-    folder: the result folder.
+    folder: the result folder. given: the camera at its given pose on the link; None: none is given.
+    With it, the points as seen from there (blue) and from the pose found (orange) are drawn, too.
+    most: number of pictures. prefix: of the files' names, before the frame's.
     """
     camera, frames = result.found.camera.name, result.found.frames
     worst = sorted(range(len(frames)), key=lambda k: frames[k].inlier_ratio)
@@ -262,4 +435,13 @@ def draw_tracks(folder: Path, result: TrackRegistration, most: int = 6) -> None:
             colour = (0, 114, 178) if fits else EXCESS_RGB
             place = round(float(u)), round(float(v))
             cv2.circle(picture, place, 4, colour, 2, cv2.LINE_AA)
-        write_file(folder, f"{OVERLAY}/{camera}/{name}.png", encode_png(picture))
+        write_file(folder, f"{OVERLAY}/{camera}/{prefix}{name}.png", encode_png(picture))
+        if given is None:
+            continue
+        picture = result.pictures[name].copy()
+        for one, colour in ((given, (0, 114, 178)), (result.found.camera, EXCESS_RGB)):
+            for place in result.points_in(one)[rows & result.inliers]:
+                if np.isfinite(place).all() and np.abs(place).max() < 1e4:
+                    centre = round(float(place[0])), round(float(place[1]))
+                    cv2.circle(picture, centre, 4, colour, 2, cv2.LINE_AA)
+        write_file(folder, f"{AS_GIVEN}/{camera}/{prefix}{name}.png", encode_png(picture))

@@ -7,11 +7,14 @@ from itertools import combinations, product
 
 import numpy as np
 from pydrake.multibody.tree import BodyIndex
+from scipy.special import ndtri
 
-from drake_pose.errors import RegistrationError
+from drake_pose.errors import RegistrationError, weighted
 from drake_pose.files.settings import percent
 from drake_pose.fit.base_edges import joint_rotation
-from drake_pose.jobs.registration.diagnosis import last_before_change, left_over
+from drake_pose.fit.covariance import vuong_statistic
+from drake_pose.fit.judge import LEVEL
+from drake_pose.jobs.registration.diagnosis import last_before_change
 from drake_pose.registration.findings import Finding, FrameDiagnosis
 from drake_pose.registration.joint_offsets import JointCalibration
 from drake_pose.registration.online_registration import pose_difference, squared_distance
@@ -22,6 +25,7 @@ from drake_pose.registration.posed_frames import (
     joints_like_cameras,
 )
 from drake_pose.registration.register import (
+    SEARCH,
     RegisteredCamera,
     RegistrationBody,
     TargetPose,
@@ -180,10 +184,7 @@ def lost_frames_warning(
 
 
 def fit_of_inliers(
-    body: RegistrationBody,
-    found: RegisteredCamera,
-    frames: Sequence[PosedFrame],
-    most: int = 24,
+    body: RegistrationBody, found: RegisteredCamera, frames: Sequence[PosedFrame], most: int = 24
 ) -> SharedFit | None:
     """Return a fit of a camera's inlier frames, at its pose; None: there are none.
 
@@ -198,15 +199,13 @@ def fit_of_inliers(
     return SharedFit([posed], [found.camera.X_CW])
 
 
-def likely_offset_warnings(
-    body: RegistrationBody, found: RegisteredCamera, frames: Sequence[PosedFrame]
-) -> list[str]:
+def likely_offset_warnings(body: RegistrationBody, camera: str, fit: SharedFit) -> list[str]:
     """Return a warning of the likeliest joint offset that would explain all frames' residuals.
 
-    The list is empty if no offset is likely. Arguments are those of `fit_of_inliers`.
+    The list is empty if no offset is likely.
+
+    ``body``: the robot's surfaces. ``camera``: its name. ``fit``: of `fit_of_inliers`.
     """
-    if (fit := fit_of_inliers(body, found, frames)) is None:
-        return []
     all_frames = np.ones(len(fit.views[0].frames), bool)
     likely = fit.likely_offsets(
         fit.fit(SHARED.stages_with_constants[-1:], fit.start, all_frames), all_frames
@@ -216,7 +215,7 @@ def likely_offset_warnings(
         unit, factor = ("deg", math.degrees(1.0)) if turns[name] else ("mm", 1e3)
         reading = describe_reading(factor * estimate[0], factor * estimate[1], unit)
         return [
-            f"camera '{found.camera.name}': its frames are explained better if joint '{name}' "
+            f"camera '{camera}': its frames are explained better if joint '{name}' "
             f"{reading}; while joint offsets are unknown, the camera's error may exceed its "
             "standard deviation: estimate them with --zeros all"
         ]
@@ -225,8 +224,8 @@ def likely_offset_warnings(
 
 def odd_link_warnings(
     body: RegistrationBody,
-    found: RegisteredCamera,
-    frames: Sequence[PosedFrame],
+    camera: str,
+    fit: SharedFit,
     without: Collection[str],
     *,
     max_ratio: float = 0.75,
@@ -236,7 +235,7 @@ def odd_link_warnings(
     """Return a warning of each link whose contour hardly fits while those of other links do.
 
     Args:
-        body, found, frames: as of `fit_of_inliers`.
+        body, camera, fit: as of `likely_offset_warnings`.
         without: names of links that were left out; links welded to their parents are not judged.
         max_ratio: maximum fitting fraction of a named link's contour, over the links' median. In
             masks by Drake's renderer links as modelled have 0.93 or more, a link with another
@@ -245,8 +244,6 @@ def odd_link_warnings(
         min_elsewhere: minimum fitting fraction of the other links' contours. Where these do not fit
             either, as with masks that are too wide everywhere, no link is odd.
     """
-    if (fit := fit_of_inliers(body, found, frames)) is None:
-        return []
     lengths, fitting = fit.matched_lengths(fit.start).T
     ratios = fitting / np.maximum(lengths, 1e-9)
     shown = lengths >= min_fraction * max(float(lengths.sum()), 1e-9)
@@ -274,7 +271,7 @@ def odd_link_warnings(
         outermost = min(welded, key=lambda name: len(model.carried_by(name)), default=node)
         more = "" if outermost == node else f" (with {outermost})"
         texts.append(
-            f"camera '{found.camera.name}': {percent(float(ratios[k]))} of the contour of link "
+            f"camera '{camera}': {percent(float(ratios[k]))} of the contour of link "
             f"'{node}'{more} fits, elsewhere {elsewhere}: is another gripper or tool mounted, a "
             "camera or a cable, is a joint before it misread (drake-pose audit tells), or are the "
             f"pictures distorted? --without {outermost} leaves it out, with what it carries"
@@ -282,43 +279,89 @@ def odd_link_warnings(
     return texts
 
 
-def outlier_warnings(found: RegisteredCamera, from_pictures: bool = False) -> list[str]:
+def frames_of_other_rows(
+    body: RegistrationBody, found: RegisteredCamera, frames: Sequence[PosedFrame], most: int = 24
+) -> list[str]:
+    """Return the outlier frames that the joint positions of another frame explain better.
+
+    A frame's mask is compared with the body at the positions of at most ``most`` frames. With
+    those that explain it best, its contours must cost less at LEVEL, over all that were tried, and
+    as much of them must fit as in the worst inlier frame: a bad mask fits no positions.
+
+    ``body``: the robot's surfaces. ``found``: the registered camera. ``frames``: its frames.
+    """
+    named = list[str]()
+    least = min((k.inlier_ratio for k in found.frames if k.is_inlier), default=1)
+    rows = [one.values for one in evenly_spaced(frames, most)]
+    for frame in (one for one in frames if one.name in found.outliers):
+        tried = [frame, *(replace(frame, values=row) for row in rows)]
+        posed = PosedFrames(body.kinematics, body.full, found.camera, tried, LAST_SPACING)
+        fit = SharedFit([posed], [found.camera.X_CW])
+        costs = fit.tile_costs(fit.start, max(1.0, SEARCH.tile_side * posed.size))
+        best = 1 + int(np.argmin(costs[1:].sum(axis=(1, 2))))
+        chance = LEVEL / len(rows)
+        if vuong_statistic(costs[0], costs[best]) > ndtri(1.0 - chance) and (
+            fit.inlier_ratios(fit.start)[best] >= least
+        ):
+            named.append(frame.name)
+    return named
+
+
+def outlier_warnings(
+    found: RegisteredCamera, from_pictures: bool = False, misplaced: Collection[str] = ()
+) -> list[str]:
     """Return warnings of a camera's outlier frames.
 
-    from_pictures: whether the camera was registered from pictures.
+    from_pictures: whether the camera was registered from pictures. misplaced: outlier frames of
+        `frames_of_other_rows`; the masks of others are suspected.
 
     Raises RegistrationError: half of the masks or more are outliers. In pictures this is a warning:
         the frames of the fit agree, and the others may be dark or blurred.
     """
     name, frames = found.camera.name, [frame.frame for frame in found.frames]
-    wrong, texts, moved = found.outliers, [], ""
-    last = last_before_change([frame in wrong for frame in frames])
+    wrong = found.outliers
+    if not wrong:
+        return []
+    right = [frame for frame in frames if frame not in wrong]
+    last, moved = last_before_change([frame in wrong for frame in frames]), ""
     if last is not None:
         moved = f" Were camera or base moved after frame '{frames[last]}'?"
-    if wrong:
-        right = len(frames) - len(wrong)
-        text = (
-            f"camera '{name}': {len(wrong)} of {len(frames)} frames are outliers and did not "
-            f"count: {frame_ranges(wrong, frames)}; are their joint positions those of the "
-            f"pictures?{moved}"
+    told = f"{len(wrong)} of {len(frames)}: {frame_ranges(wrong, frames)}"
+    if 2 * len(right) <= len(frames) and not from_pictures:
+        raise RegistrationError(
+            f"camera '{name}': half of the frames or more are outliers, {told}.{moved} Either "
+            f"these are wrong, or the others, {frame_ranges(right, frames)}, agree by chance: is "
+            "this the robot's model, with covers and tools, and are the joint positions those of "
+            "the pictures and in the model's zeros (--zeros all)? If the others are right, give a "
+            "scene of them alone. Nothing was written"
         )
-        if 2 * right <= len(frames):
-            supporting = frame_ranges([frame for frame in frames if frame not in wrong], frames)
-            if not from_pictures:
-                raise RegistrationError(
-                    f"camera '{name}': half of the frames or more are outliers, {len(wrong)} of "
-                    f"{len(frames)}: {frame_ranges(wrong, frames)}.{moved} Either these are wrong, "
-                    f"or the others, {supporting}, agree by chance: is this the robot's model, "
-                    "with covers and tools, and are the joint positions those of the pictures and "
-                    "in the model's zeros (--zeros all)? If the others are right, give a scene of "
-                    "them alone. Nothing was written"
-                )
-            text += (
-                f" FEWER THAN HALF OF THE FRAMES AGREE, {right} of {len(frames)}: {supporting}; "
-                "the pose rests on these alone and may be wrong: correct the others, or add frames"
-            )
-        texts.append(text)
-    return texts
+    texts = [f"camera '{name}': {len(wrong)} of {len(frames)} frames are outliers and did not "
+             f"count: {frame_ranges(wrong, frames)}"]  # fmt: skip
+    doubted = [frame for frame in wrong if frame not in misplaced]
+    if doubted and math.isnan(found.frames[0].E_total):
+        texts.append("few points of the scene fit there: did things move?")
+    elif doubted:
+        what = "what hides the robot there" if from_pictures else "their masks"
+        texts.append(
+            f"no other frame's joint positions explain {frame_ranges(doubted, frames)}: check "
+            f"{what} first"
+        )
+    if misplaced:
+        texts.append(
+            f"the joint positions of other frames explain {frame_ranges(misplaced, frames)} "
+            "better: are their joint positions those of the pictures?"
+        )
+    text = "; ".join(texts) + moved
+    if 2 * len(right) > len(frames):
+        return [text]
+    return [
+        weighted(
+            f"{text} FEWER THAN HALF OF THE FRAMES AGREE, {len(right)} of {len(frames)}: "
+            f"{frame_ranges(right, frames)}; the pose rests on these alone and may be wrong: "
+            "correct the others, or add frames",
+            "wrong",
+        )
+    ]
 
 
 def zero_warnings(
@@ -337,12 +380,13 @@ def zero_warnings(
         X = joint_rotation(body.kinematics, values[0], joint, OFFSET_UNITS[0])
         off = pose_difference(X @ camera.X_WC, camera.X_WC)
         if squared_distance(off, found.covariance) < 1.0:
-            return [
+            text = (
                 f"camera '{camera.name}': it is known relative to the zero of joint '{name}', on "
                 "which all depends that is seen and not round: if this joint reads a degree too "
                 "high, the camera is turned by a degree about its axis. The standard deviations "
                 f"allow for half a degree; --zeros {name} allows for more"
-            ]
+            )
+            return [weighted(text, "note")]
     return []
 
 
@@ -396,11 +440,12 @@ def parameter_warnings(found: JointCalibration) -> list[str]:
     requested = [(f"joint '{offset.name}': its offset", offset) for offset in found.offsets]
     requested += [(f"link '{scale.name}': its length", scale) for scale in found.link_scales]
     if requested and not any(parameter.significant for _, parameter in requested):
-        uncertain = [
+        text = (
             "none of the requested joint offsets and link lengths is significant beside other "
             "errors (of each other, focal length, principal point, masks): no corrected URDF is "
             "written"
-        ]
+        )
+        uncertain: list[str] = [weighted(text, "note")]
     else:
         uncertain = [
             f"{what} is good to {np.degrees(one.deviation):.2g} degrees only, and turns the camera "
@@ -431,14 +476,14 @@ def target_warnings(pose: TargetPose) -> list[str]:
         axes = "; ".join(", ".join(f"{x:.3f}" for x in axis) for axis in pose.symmetry_axes)
         texts.append(
             f"the target is round about an axis ({axes} in its frame), so its rotation about it is "
-            "not determined; the camera's pose does not depend on it"
+            "not determined"
         )
     if len(pose.alternatives):
         texts.append(
             f"the target looks the same in {len(pose.alternatives)} other poses, see its modes in "
-            "summary.json; the camera's pose does not depend on it"
+            "summary.json"
         )
-    return texts
+    return [weighted(f"{text}; the camera's pose does not depend on it", "note") for text in texts]
 
 
 def few_frames_warning(found: RegisteredCamera) -> str:
@@ -451,7 +496,10 @@ def few_frames_warning(found: RegisteredCamera) -> str:
 
 
 def common_outlier_warnings(
-    registered: Iterable[RegisteredCamera], *, from_pictures: bool = False, worse: float = 2.0
+    registered: Iterable[RegisteredCamera],
+    *,
+    from_pictures: bool = False,
+    misplaced: Collection[str] = (),
 ) -> list[str]:
     """Return warnings that compare several cameras' inliers.
 
@@ -459,52 +507,35 @@ def common_outlier_warnings(
     cameras were registered from masks, they name pairs of cameras that have common frames, but no
     common inlier frame.
 
-    worse: E_total of an inlier frame, over its camera's median and a percent more, from which the
-    frame does not support its joint positions against another camera.
+    misplaced: frames of `frames_of_other_rows`, in any camera.
     """
-    is_inlier: dict[str, dict[str, bool]] = {}
-    sets, frames_of = dict[str, list[str]](), dict[str, set[str]]()
-    doubted = set[str]()
+    seen, right = dict[str, list[str]](), dict[str, list[str]]()
     for found in registered:
-        usual = worse * left_over(found) + 0.01
-        for misfit in found.frames:
-            is_inlier.setdefault(misfit.frame, {})[found.camera.name] = misfit.is_inlier
-            if misfit.is_inlier and misfit.E_total > usual:
-                doubted.add(misfit.frame)
-        sets[found.camera.name] = [frame.frame for frame in found.frames if frame.is_inlier]
-        frames_of[found.camera.name] = {frame.frame for frame in found.frames}
-    frames, masks = list(is_inlier), dict[str, list[str]]()
-    positions = [k for k, own in is_inlier.items() if len(own) > 1 and not any(own.values())]
-    for frame, inliers in is_inlier.items():
-        for name, right in inliers.items() if any(inliers.values()) else ():
-            if not right:
-                masks.setdefault(name, []).append(frame)
-    why = "something hides the robot there" if from_pictures else "their masks are not"
+        seen[found.camera.name] = [frame.frame for frame in found.frames]
+        right[found.camera.name] = [frame.frame for frame in found.frames if frame.is_inlier]
+    frames = list(dict.fromkeys(frame for own in seen.values() for frame in own))
+    wrong = dict[tuple[str, str], list[str]]()
+    reason = "something hides the robot there" if from_pictures else "their masks are not"
+    for frame in frames:
+        cameras = [name for name, own in seen.items() if frame in own]
+        outliers = [name for name in cameras if frame not in right[name]]
+        places = [f"camera '{name}', but not in another one that sees them" for name in outliers]
+        why = f"their joint positions are right, {reason}"
+        if outliers == cameras:
+            places = ["all cameras that see them"]
+            why = "check their masks, then their joint positions, or leave these frames out"
+        if frame in misplaced:
+            why = "the joint positions of other frames explain them better: correct theirs"
+        for place in places if len(cameras) > 1 else ():
+            wrong.setdefault((place, why), []).append(frame)
     texts = [
-        f"cameras '{a}' and '{b}' rest on no common frame: '{a}' on {frame_ranges(own, frames)}, "
-        f"'{b}' on {frame_ranges(other, frames)}: if cameras or base were moved in between, their "
-        "poses do not belong together"
-        for (a, own), (b, other) in combinations(sets.items(), 2)
-        if frames_of[a] & frames_of[b] and not {*own} & {*other} and not from_pictures
+        f"cameras '{a}' and '{b}' rest on no common frame: '{a}' on "
+        f"{frame_ranges(right[a], frames)}, '{b}' on {frame_ranges(right[b], frames)}: if cameras "
+        "or base were moved in between, their poses do not belong together"
+        for a, b in combinations(seen, 2)
+        if {*seen[a]} & {*seen[b]} and not {*right[a]} & {*right[b]} and not from_pictures
     ]
-    if positions:
-        texts.append(
-            f"frames {frame_ranges(positions, frames)} are outliers in all cameras that see them: "
-            "their joint positions are not those of the pictures; correct them, or leave these "
-            "frames out"
-        )
-    for name, wrong in masks.items():
-        unsure = [frame for frame in wrong if frame in doubted]
-        sure = [frame for frame in wrong if frame not in doubted]
-        if sure:
-            texts.append(
-                f"frames {frame_ranges(sure, frames)} are outliers in camera '{name}', but not in "
-                f"another one that sees them: their joint positions are right, {why}"
-            )
-        if unsure:
-            texts.append(
-                f"frames {frame_ranges(unsure, frames)} are outliers in camera '{name}', and fit "
-                "worse than others in another one that sees them: check their joint positions, "
-                "then their pictures"
-            )
-    return texts
+    return texts + [
+        f"frames {frame_ranges(own, frames)} are outliers in {place}: {why}"
+        for (place, why), own in wrong.items()
+    ]

@@ -438,7 +438,7 @@ def learn_recorded_faces(folder: Path) -> FaceTemplates:
         table[name] = turn, nod
     faces = []
     for name in table:
-        picture = read_picture(folder / name, SceneError)
+        picture = read_picture(folder / name)
         region = np.ones(picture.shape[:2], dtype=np.bool_)
         face = cut_face(picture, skin_blobs(picture, region))
         if face is None:

@@ -2,11 +2,13 @@
 
 import io
 import json
+import re
 import zlib
-from collections.abc import Container, Mapping
+from collections.abc import Container, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
+from urllib.parse import unquote, urlsplit
 
 import cv2
 import numpy as np
@@ -15,7 +17,7 @@ from PIL import Image
 from drake_pose.arrays import Mask
 from drake_pose.camera.models import LARGEST_SIDE
 from drake_pose.camera.picture_files import read_binary_mask
-from drake_pose.errors import MaskError
+from drake_pose.errors import MaskError, SceneError
 from drake_pose.input_files import read_regular
 
 
@@ -32,8 +34,10 @@ def read_mask(
     without an object is accepted. Raises MaskError, which names the file: it cannot be read, is no
     complete PNG picture, has the wrong size, is empty or full, or has more than two colours.
     """
-    size = width, height
-    return read_binary_mask(Path(path), MaskError, size, may_be_empty=may_be_empty)
+    try:
+        return read_binary_mask(Path(path), (width, height), may_be_empty=may_be_empty)
+    except SceneError as error:
+        raise MaskError(str(error)) from None
 
 
 def encode_mask(mask: np.ndarray) -> bytes:
@@ -94,12 +98,17 @@ def signed_distances(mask: np.ndarray) -> np.ndarray:
     return np.where(inside > 0, 0.5 - within, beyond - 0.5).astype(np.float32)
 
 
+LARGEST_COCO = 1 << 30
+"""Largest size of a COCO file [byte]."""
+
+
 @dataclass(frozen=True)
 class AnnotatedPicture:
     """A picture of a COCO file with its annotations."""
 
     source: Path  # The COCO file.
-    file: PurePosixPath  # The picture's file, as in the COCO file.
+    name: str  # Name of the picture's file in the COCO file.
+    file: PurePosixPath  # The file that was annotated, see `original_files`.
     # height, width: size [pixel].
     height: int
     width: int
@@ -115,13 +124,20 @@ class AnnotatedPicture:
         return mask
 
 
+def is_coco(path: Path) -> bool:
+    """Return whether a JSON file has annotations of pictures, as COCO files do."""
+    content = read_regular(path, LARGEST_COCO)
+    return b'"annotations"' in content and b'"images"' in content
+
+
 def read_coco(path: Path) -> list[AnnotatedPicture]:
     """Read the pictures of a COCO file; MaskError names the file and what is invalid."""
     try:
-        content = json.loads(read_regular(path, 1 << 30))
+        content = json.loads(read_regular(path, LARGEST_COCO))
         names = {one["id"]: str(one["name"]) for one in content.get("categories", ())}
         pictures: dict[Any, AnnotatedPicture] = {}
-        for one in content["images"]:
+        originals = original_files(content["images"])
+        for one, original in zip(content["images"], originals, strict=True):
             if one["id"] in pictures:
                 raise ValueError(f"image {one['id']} is given twice")
             file, height, width = (one[key] for key in ("file_name", "height", "width"))
@@ -129,9 +145,9 @@ def read_coco(path: Path) -> list[AnnotatedPicture]:
                 raise ValueError(
                     f"width and height must be whole numbers of 2 to {LARGEST_SIDE} pixels"
                 )
-            if not str(file).isprintable():
+            if not (original.name and str(original).isprintable()):
                 raise ValueError(f"{file!r} is not a name of a picture file")
-            pictures[one["id"]] = AnnotatedPicture(path, PurePosixPath(file), height, width, [])
+            pictures[one["id"]] = AnnotatedPicture(path, str(file), original, height, width, [])
         for one in content["annotations"]:
             number = one["category_id"]
             area = (names.get(number, str(number)), str(number), one.get("segmentation"))
@@ -144,6 +160,35 @@ def read_coco(path: Path) -> list[AnnotatedPicture]:
             f"{path}: is not a COCO file, which has images and their annotations: {what}"
         ) from error
     return list(pictures.values())
+
+
+def original_files(images: Iterable[Mapping[str, Any]]) -> list[PurePosixPath]:
+    """Return the files that were given to the tool that wrote a COCO file's ``images``.
+
+    Paths may be Windows', URLs, or the parameter ``d`` of Label Studio's URLs. Label Studio puts
+    eight random hexadecimal digits and a hyphen (or two underscores) before each name; Roboflow
+    puts the suffix and a hash behind it, `0000_jpg.rf.<hash>.jpg`, and keeps the name in ``extra``.
+    """
+    files = []
+    for one in images:
+        name: str = one["file_name"]
+        url = urlsplit(name)
+        local = re.search(r"(?:^|&)d=([^&]+)", url.query)
+        text = local[1] if local else url.path if url.netloc else name
+        parts = unquote(text).replace("\\", "/").split("/")
+        extra = one.get("extra")
+        if isinstance(extra, dict) and extra.get("name"):
+            parts[-1:] = str(extra["name"]).replace("\\", "/").split("/")
+        file = PurePosixPath(*(part for part in parts if part != ".." and not part.endswith(":")))
+        if exported := re.fullmatch(r"(.+)_([A-Za-z]{3,4})\.rf\.[^.]+", file.stem):
+            file = file.with_name(f"{exported[1]}.{exported[2]}")
+        files.append(file)
+    while True:
+        prefixes = [re.match("[0-9a-f]{8}(?:-|__)(?=.+[.])", file.name) for file in files]
+        found = {prefix[0] for prefix in prefixes if prefix}
+        if len(found) < len(files) or not re.search("[a-f]", "".join(found)):
+            return files
+        files = [file.with_name(re.split("-|__", file.name, maxsplit=1)[1]) for file in files]
 
 
 def draw_area(area: Any, height: int, width: int) -> Mask:

@@ -5,26 +5,28 @@ import zlib
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
+from functools import partial
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from drake_pose.arrays import Array
+from drake_pose.arrays import Array, Picture
 from drake_pose.camera.camera_files import load_camera_file, load_cameras
 from drake_pose.camera.episode import JointLog
 from drake_pose.camera.episode_files import read_sequence, require_recording
 from drake_pose.camera.models import Camera, ParallelCamera
 from drake_pose.camera.picture_files import (
-    VIDEOS,
-    VideoPictures,
+    Video,
     find_recorded_files,
+    frame_key,
     frame_number,
     in_order,
     natural_key,
     picture_size,
     read_picture,
 )
+from drake_pose.camera.sources import picture_times
 from drake_pose.errors import (
     SceneError,
     SettingsError,
@@ -56,8 +58,8 @@ class Scene:
             frames. A frame without a mask is tracked by colours. Empty if every picture has a mask.
         unknown_folders: folders of masks that belong to no camera.
         warnings: faults of the folder that are not fatal.
-        readers: functions that return a camera's picture (H, W, 3) by frame, for cameras without
-            picture files.
+        readers: functions that return a camera's picture (H, W, 3) by frame, for cameras of videos
+            and episodes.
         times: (frames,) recorded times [s], NaN where unknown.
         joints: the robot's recorded joint positions, by time or by frame; None: not recorded.
     """
@@ -75,7 +77,6 @@ class Scene:
     readers: Mapping[str, Callable[[str], np.ndarray]] = field(default_factory=dict)
     times: Array = field(default_factory=lambda: np.empty(0), compare=False)
     joints: JointLog | None = None
-    _videos: dict[Path, VideoPictures] = field(default_factory=dict, repr=False, compare=False)
     _packed: dict[tuple[Path, int, int], tuple[Sequence[int], bytes]] = field(
         default_factory=dict, repr=False, compare=False
     )
@@ -177,14 +178,8 @@ class Scene:
         file, size = self._file(self.images, camera, frame), self.cameras[camera]
         if self._latest.get(camera, ("",))[0] == frame:
             return self._latest[camera][1].copy()
-        if camera in self.readers:
-            picture = self.readers[camera](frame)
-        elif file.suffix.lower() in VIDEOS:
-            if file not in self._videos:
-                self._videos[file] = VideoPictures(file)
-            picture = self._videos[file].read(int(frame))
-        else:
-            picture = read_picture(file, SceneError)
+        read = self.readers.get(camera)
+        picture = read_picture(file) if read is None else read(frame)
         if picture.shape[:2] != (size.height, size.width):
             raise SceneError(
                 f"{file}: is {picture.shape[1]} x {picture.shape[0]} pixels, but camera "
@@ -197,25 +192,16 @@ class Scene:
     def require_images(self, frames: Collection[str]) -> None:
         """Check that the pictures of these frames can be read, before the work on them begins.
 
-        Of PNG and JPEG files size and structure are checked, videos are decoded.
+        Of PNG and JPEG files size and structure are checked, others are decoded.
 
         Raises SceneError: the file is not a picture of the camera's size.
         """
-        last: dict[str, str] = {}
         for (name, frame), file in self.images.items():
-            if frame not in frames:
-                continue
-            size = self.cameras[name]
-            if name not in self.readers and file.suffix.lower() in VIDEOS:
-                last[name] = max(frame, last.get(name, frame), key=int)
-            elif name in self.readers or picture_size(file, SceneError) != (
-                size.width,
-                size.height,
+            own = self.cameras[name]
+            if frame in frames and (
+                name in self.readers or picture_size(file) != (own.width, own.height)
             ):
                 self.read_image(name, frame)
-        for name, frame in last.items():
-            self.read_image(name, frame)
-            self._videos[self.images[name, frame]].require_before(int(frame))
 
     def _file(self, files: Mapping[tuple[str, str], Path], camera: str, frame: str) -> Path:
         """Return the file of a camera's frame in ``files``; UnknownNameError: there is none."""
@@ -273,20 +259,37 @@ def load_scene(
         else:
             cameras = load_cameras(folder / CAMERA_FILE)
     has_masks = (folder / "masks").is_dir()
-    images: dict[tuple[str, str], Path] = {}
     masks, unknown_folders, warnings = find_masks(folder, cameras) if has_masks else ({}, (), ())
-    if sequence:
-        images = find_images(folder, cameras, in_order(frame for _, frame in masks))
+    known = {int(frame): frame for _, frame in masks if frame.isdecimal()}
+    recorded = {name: find_recorded_files(folder, name) for name in cameras if sequence}
+    images: dict[tuple[str, str], Path] = {}
+    videos: dict[str, Video] = {}
+    for name, files in recorded.items():
+        if isinstance(files, Path):
+            videos[name] = Video(files)
+            count = range(len(videos[name].times))
+            files = {known.get(k, f"{k:06d}"): files for k in count}
+        images |= {(name, frame): file for frame, file in (files or {}).items()}
     if not (images or has_masks):
         raise SceneError(f"{folder}: has no folder masks/<camera>/<frame>.png")
-    is_video = {name: file for (name, _), file in images.items() if file.suffix.lower() in VIDEOS}
-    rate_hz, drifts = common_rate(is_video)
+    rate_hz, drifts = common_rate(videos)
     if all(key in masks for key in images):
         images = {}
+    frames = in_order(frame for _, frame in (*masks, *images))
+    first, stamped = next(iter(images), ("", ""))[0], dict[str, float]()
+    if first in videos:
+        stamped = {str(k): time for k, time in enumerate(videos[first].times.tolist())}
+    elif first:
+        files = {frame: file for (name, frame), file in images.items() if name == first}
+        try:
+            stamped = picture_times(files, frame_rate_hz)
+        except SceneError as error:
+            drifts = (*drifts, f"{error}; the times of the pictures are not known")
+    times = {frame_key(frame): time for frame, time in stamped.items()}
     return Scene(
         folder,
         dict(cameras),
-        in_order(frame for _, frame in (*masks, *images)),
+        frames,
         masks,
         sequence,
         frame_rate_hz or rate_hz,
@@ -294,7 +297,14 @@ def load_scene(
         unknown_folders=unknown_folders,
         # A sequence with pictures may lack masks, so that is no reason for a warning.
         warnings=drifts if images else warnings,
+        readers={name: partial(_read_frame, video) for name, video in videos.items()},
+        times=np.array([times.get(frame_key(frame), np.nan) for frame in frames]),
     )
+
+
+def _read_frame(video: Video, frame: str) -> Picture:
+    """Return a video's picture (H, W, 3) of a frame, which is named by its number."""
+    return video.read(int(frame))
 
 
 def _unknown_cameras(folder: Path) -> tuple[dict[str, Camera], dict[tuple[str, str], Path]]:
@@ -326,32 +336,33 @@ def _unknown_cameras(folder: Path) -> tuple[dict[str, Camera], dict[tuple[str, s
 
 
 def common_rate(
-    videos: Mapping[str, Path], max_ratio: float = 1.01
+    videos: Mapping[str, Video], max_ratio: float = 1.01
 ) -> tuple[float | None, tuple[str, ...]]:
-    """Return the common frame rate of videos [frames/s], and a warning if they drift apart.
+    """Return the common frame rate of videos [frames/s], and warnings.
 
-    The rate is None if no video has one. There is a warning if videos are a picture or more apart
-    at the end of the shortest; otherwise the tuple is empty.
+    The rate is None if no video has one. There is a warning if videos are truncated, or a picture
+    or more apart at the end of the shortest.
 
-    ``videos``: video files by camera. ``max_ratio``: largest ratio of the highest to the lowest
-    rate. Raises SceneError: a video cannot be read, or the ratio is larger.
+    ``videos``: videos by camera. ``max_ratio``: largest ratio of the highest to the lowest rate.
+    Raises SceneError: the ratio is larger.
     """
-    opened = {name: VideoPictures(path) for name, path in videos.items()}
-    rates = {name: video.rate_hz for name, video in opened.items() if video.rate_hz is not None}
+    warnings = [text for video in videos.values() for text in video.warnings]
+    rates = {name: video.rate_hz for name, video in videos.items() if video.rate_hz is not None}
     if not rates:
-        return None, ()
+        return None, tuple(warnings)
     slow = min(rates, key=lambda name: rates[name])
     fast = max(rates, key=lambda name: rates[name])
     ratio = rates[fast] / rates[slow]
-    drift = min(video.count for video in opened.values()) * (ratio - 1.0)
+    drift = min(len(video.times) for video in videos.values()) * (ratio - 1.0)
     text = (
-        f"{videos[slow]} has {rates[slow]:.5g} pictures a second, {videos[fast]} {rates[fast]:.5g}:"
-        f" pictures of equal number must be synchronised, but at the end they are {drift:.0f} "
-        "pictures apart; bring the videos to one rate (ffmpeg -i VIDEO -r RATE NEW)"
+        f"{videos[slow].path} has {rates[slow]:.5g} pictures a second, {videos[fast].path} "
+        f"{rates[fast]:.5g}: pictures of equal number must be synchronised, but at the end they "
+        f"are {drift:.0f} pictures apart; bring the videos to one rate (ffmpeg -i VIDEO -r RATE "
+        "NEW)"
     )
     if ratio > max_ratio:
         raise SceneError(text)
-    return next(iter(rates.values())), (text,) if drift >= 1.0 else ()
+    return next(iter(rates.values())), (*warnings, *([text] if drift >= 1.0 else []))
 
 
 def select_frames(known: Sequence[str], wanted: Sequence[str], where: str) -> tuple[str, ...]:
@@ -404,9 +415,7 @@ def find_masks(
     if not root.is_dir():
         raise SceneError(f"{folder}: has no folder masks/<camera>/<frame>.png")
     flat, foreign = _list_masks(root)
-    found = {
-        entry.name: _list_masks(root / entry.name) for entry in _visible(root) if entry.is_dir()
-    }
+    found = {one[:-1]: _list_masks(root / one[:-1]) for one in foreign if one.endswith("/")}
     known = {name: found[name][0] for name in names if name in found}
     unknown_folders = {name: len(files) for name, (files, _) in found.items() if name not in names}
     if flat and not any(known.values()):
@@ -424,8 +433,7 @@ def find_masks(
         if files := [f"{name}/{file}" for name, own in others.items() for file in own]:
             text += f"; {files[0]} is {'a folder' if files[0].endswith('/') else 'no PNG picture'}"
         raise SceneError(text)
-    others[""] = [name for name in foreign if not name.endswith("/")]
-    others[""] += [path.name for path in flat]
+    others[""] = [one for one in foreign if not one.endswith("/")] + [path.name for path in flat]
     masks, doubled = _join_frames(known)
     unused, warnings = [name for name in names if not known.get(name)], list[str]()
     lower = {name.lower(): name for name in unused}
@@ -449,38 +457,6 @@ def find_masks(
                 "pictures in masks/<camera>"
             )
     return masks, tuple(unknown_folders), tuple(warnings)
-
-
-def find_images(
-    folder: Path, cameras: Iterable[str], frames: Iterable[str] = ()
-) -> dict[tuple[str, str], Path]:
-    """Find ``images/<camera>/<frame>.png`` or ``.jpg``, or frames of ``videos/<camera>.mp4``.
-
-    A video's frames are named 000000, 000001 and so on, or like the known frame of that number.
-
-    ``cameras``: names of the cameras. ``frames``: names of known frames, for frames of videos;
-    empty: none.
-
-    Returns picture or video files by (camera, frame).
-
-    Raises SceneError: a folder or video cannot be read.
-    """
-    found: dict[tuple[str, str], Path] = {}
-    known = {int(frame): frame for frame in frames if frame.isdecimal()}
-    for camera in cameras:
-        files = find_recorded_files(folder, camera)
-        if isinstance(files, Path):
-            numbers = range(VideoPictures(files).count)
-            # A picture takes at least a byte; an unfinished recording has no valid count.
-            if not 0 < len(numbers) <= files.stat().st_size:
-                raise SceneError(
-                    f"{files}: its number of pictures is missing or too large for its size; "
-                    f"repair it: ffmpeg -i {files.name} -c copy NEW"
-                )
-            found |= {(camera, known.get(k, f"{k:06d}")): files for k in numbers}
-        elif files:
-            found |= {(camera, frame): file for frame, file in files.items()}
-    return found
 
 
 def _visible(folder: Path) -> list[os.DirEntry[str]]:

@@ -1,8 +1,5 @@
 """Estimates of a real robot arm from damaged masks, with intervals that contain the truth."""
 
-import itertools
-from collections.abc import Iterator
-
 import numpy as np
 import pytest
 
@@ -13,24 +10,6 @@ from drake_pose.silhouette.outline import TreeSurfaces
 from drake_pose.silhouette.scoring import draw_mask
 
 BASE = slice(0, 4)
-
-
-def flipped_arms(values: np.ndarray) -> Iterator[np.ndarray]:
-    """Return other angles of the same pose: A1 + 180, -A2, A3 + 180, and so on."""
-    for chosen in itertools.product((False, True), repeat=3):
-        flipped = values.copy()
-        for k in np.flatnonzero(chosen):
-            flipped[2 * k] += np.pi
-            flipped[2 * k + 1] *= -1.0
-            flipped[2 * k + 2] += np.pi
-        yield flipped
-
-
-def base_errors(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """Return errors (4,) to the encoders' angles or equivalent ones, whichever is nearer [deg]."""
-    turns = [(one - truth + np.pi) % (2.0 * np.pi) - np.pi for one in flipped_arms(found)]
-    best = min(turns, key=lambda turn: (np.abs(turn[BASE]).sum(), np.abs(turn).sum()))
-    return np.degrees(np.abs(best[BASE]))
 
 
 def view_errors(inputs: EstimateInputs, views: list[View], values: np.ndarray) -> np.ndarray:
@@ -49,14 +28,14 @@ def view_errors(inputs: EstimateInputs, views: list[View], values: np.ndarray) -
 def test_estimates_of_a_real_arm_lie_in_their_intervals(shared_data):
     scene = shared_data / "arm_two_views"
     inputs = read_inputs(scene, scene / "med7" / "med7.urdf", EstimateSettings(), None)
-    all_held, errors = [], []
+    all_held = []
     for frame in inputs.frames:
         views = [
             View(camera, inputs.scene.read(camera.name, frame))
             for camera in inputs.scene.cameras.values()
             if (camera.name, frame) in inputs.scene.masks
         ]
-        truth = inputs.truth.of(frame)
+        (truth,) = inputs.truth.of_frames([frame])
         result = inputs.search.match(views)
         found = np.concatenate(result.node_values)
         excess = view_errors(inputs, views, found) - view_errors(inputs, views, truth)
@@ -68,7 +47,5 @@ def test_estimates_of_a_real_arm_lie_in_their_intervals(shared_data):
         # These masks do not determine the flange's angle.
         assert not answer.determined[-1], frame
         all_held.append(held)
-        errors.append(base_errors(found, truth))
     # The coverage is as claimed, although the flange's angle is hardly visible.
     assert np.mean(all_held) >= 0.95
-    assert np.median(errors) <= 1.5

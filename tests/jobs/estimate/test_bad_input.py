@@ -31,16 +31,16 @@ def camera(**fields: object) -> Callable[[Path], object]:
     return lambda folder: edit_camera(folder / "cameras.yaml", "front", **fields)
 
 
-def placed(*place: float, turned: object = 1.0) -> Callable[[Path], object]:
-    """Multiply the pose of the front camera."""
-    X_WC = FRONT * np.array(turned)
+def placed(*place: float) -> Callable[[Path], object]:
+    """Move the front camera."""
+    X_WC = FRONT.copy()
     X_WC[:3, 3] = place
     return camera(X_WC=X_WC.tolist())
 
 
-def mask(picture: np.ndarray | bytes) -> Callable[[Path], object]:
+def mask(picture: np.ndarray) -> Callable[[Path], object]:
     """Replace the first mask."""
-    data = picture if isinstance(picture, bytes) else cv2.imencode(".png", picture)[1].tobytes()
+    data = cv2.imencode(".png", picture)[1].tobytes()
     return lambda folder: (folder / "masks" / "front" / "0000.png").write_bytes(data)
 
 
@@ -51,20 +51,13 @@ def file(name: str, text: str) -> Callable[[Path], object]:
 SPOILT_SCENES = [
     (shutil.rmtree, ("scene", "no such folder")),
     (lambda folder: (folder / "cameras.yaml").unlink(), ("cameras.yaml",)),
-    (file("cameras.yaml", "{"), ("cameras.yaml", "not a YAML file")),
-    (camera(focal_x=None), ("camera 'front'", "focal_x")),
-    (camera(X_WC=(2.0 * FRONT).tolist()), ("camera 'front'", "X_WC")),
-    (placed(3, 0, 0, turned=[2, 1, 1, 1]), ("camera 'front'", "not a rotation")),
-    (placed(3, 0, 0, turned=[-1, 1, 1, 1]), ("camera 'front'", "reflection")),
+    (camera(X_WC=(FRONT * [2, 1, 1, 1]).tolist()), ("camera 'front'", "not a rotation")),
     (placed(-3, 0, 0.3), ("camera 'front'", "behind")),
     (placed(0, 0, 0), ("camera 'front'", "inside the body")),
     (camera(focal_x=1e5, focal_y=1e5), ("camera 'front'", "larger than the", "focal length")),
     (camera(focal_x=1e12, focal_y=1e12), ("camera 'front'", "larger than the picture")),
     (lambda folder: shutil.rmtree(folder / "masks"), ("masks",)),
-    (mask(b"PNG"), ("0000.png", "not a PNG")),
     (mask(GREY[:, :100]), ("0000.png", "100 x 160", "200 x 160")),
-    (mask(0 * GREY), ("0000.png", "empty")),
-    (mask(0 * GREY + 255), ("0000.png", "full")),
     (mask(GREY), ("0000.png", "3 values")),
     (file("scene.yaml", "sequence: 3"), ("scene.yaml", "sequence")),
     (file("scene.yaml", 'sequence: "\\0"'), ("scene.yaml", "NUL")),
@@ -73,8 +66,7 @@ SPOILT_SCENES = [
         lambda folder: (folder / "masks/front" / os.fsdecode(b"\xfc.png")).touch(),
         ("masks/front", r"'\udcfc.png' is not UTF-8 text"),
     ),
-    (file("joint_angles.csv", "frame,lift\n0,20\n2,60\n"), ("'lift', frame 2", "in degrees")),
-    (file("joint_angles.csv", "frame,lift\n0,1e308\n"), ("'lift', frame 0", "too large for")),
+    (file("joint_angles.csv", "frame,lift\n0,1e308\n"), ("'lift', frame 0", "no joint position")),
 ]
 
 
@@ -116,9 +108,7 @@ def test_devices_and_sockets_are_never_opened(kind, place, own_scene):
 MESH = URDF.replace('<box size="0.1 0.08 0.4"/>', '<mesh filename="jib.obj"/>')
 SPOILT_MODELS = [
     ("<robot", ("spoilt.urdf",)),
-    (URDF.replace("<visual>", "<!--").replace("</visual>", "-->"), ("no visual geometry",)),
     (MESH, ("spoilt.urdf", "jib.obj")),
-    (URDF.replace('lower="-1.6"', 'lower="nan"'), ("spoilt.urdf", "joint 'lift'")),
     (URDF.replace('lower="-1.6"', 'lower="1.7"'), ("spoilt.urdf", "joint 'lift'", "1.7")),
     (
         re.sub(r'(?s)("luff" type=)"revolute"(.*?)<limit[^>]*>', r'\1"prismatic"\2', URDF),
@@ -157,19 +147,9 @@ def test_model_file(own_scene, tmp_path):
         ("--root-position nowhere.csv:toe", ("nowhere.csv",)),
         ("--root jib --root-position {0}:hook --frame 2", ("centres.csv", "'0002'")),
         ("--truth nowhere.csv", ("nowhere.csv",)),
-        ("--truth {0}", ("'joint'", "lift, luff")),
+        ("--truth {0}", ("'joint'", "not a number")),
         ("--root jib", ("root 'jib'",)),
-    ],
-)
-def test_unknown_names_are_refused(options, parts, own_scene):
-    centres = own_scene.folder / "centres.csv"
-    centres.write_text("frame,joint,x,y,z\n0,hook,0,0,1\n1,hook,0,0,1\n")
-    assert_refused(run(own_scene, *options.format(centres).split()), *parts)
-
-
-@pytest.mark.parametrize(
-    ("options", "part"),
-    [
+        # Wrong usage: parts of the message.
         ("--root-position 1,2", "--root-position"),
         ("--root-rotation upright", "--root-rotation"),
         ("--hold lift", "--hold"),
@@ -178,8 +158,12 @@ def test_unknown_names_are_refused(options, parts, own_scene):
         ("--every many", "--every"),
     ],
 )
-def test_wrong_usage(options, part, tiny_scene):
-    assert_refused(run(tiny_scene, *options.split()), part, status=2)
+def test_unknown_names_and_wrong_usage_are_refused(options, parts, own_scene):
+    centres = own_scene.folder / "centres.csv"
+    centres.write_text("frame,joint,x,y,z\n0,hook,0,0,1\n1,hook,0,0,1\n")
+    is_usage = isinstance(parts, str)
+    done = run(own_scene, *options.format(centres).split())
+    assert_refused(done, *([parts] if is_usage else parts), status=1 + is_usage)
 
 
 def test_rotation_without_a_root(own_scene, tmp_path):

@@ -96,7 +96,7 @@ def test_stages_are_reported(recording, known):
 
 def test_estimate_chooses_the_method_person_and_says_so(recording, known, out):
     result, summary = run_estimate(recording, out)
-    assert "fitted to all silhouettes" in result.stdout
+    assert "Pose found in 3 of 3 frames" in result.stdout
     assert known == [FRAMES]
     assert {path.name for path in out.iterdir()} == FILES | {"overlay"}
     assert summary["complete"] is True
@@ -203,7 +203,7 @@ def test_an_interrupted_capture_is_incomplete_and_resumes_without_loss(recording
     ],
 )  # fmt: skip
 def test_options_of_the_search_choose_the_search(recording, more, monkeypatch):
-    monkeypatch.setattr(inputs, "make_search", lambda *_: 1 / 0)
+    monkeypatch.setattr(inputs, "make_tree", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         estimate_scene(recording.folder, recording.person.path, settings=EstimateSettings(**more))
 
@@ -222,13 +222,13 @@ def test_pictures_with_few_masks_are_refused(own_recording):
 
 
 def test_scenes_and_options_unfit_for_the_method_person_are_refused(recording, out):
-    for name, value in {"hold": {"head_y": 1.0}, "start": Path("start.csv")}.items():
-        with pytest.raises(SettingsError, match=f"leave {name} out"):
-            EstimateSettings(method="person", **{name: value})
-    hand = bundled_model("hand")
-    with pytest.raises(ModelError, match=r"left_ankle.*landmarks\.yaml"):
-        estimate_scene(recording.folder, hand, out, EstimateSettings(method="person"))
-    alone = EstimateSettings(method="person", cameras=("camera_0",))
-    with pytest.raises(SceneError, match="two or more calibrated cameras"):
-        estimate_scene(recording.folder, recording.person.path, out, alone)
+    person, alone = recording.person.path, {"cameras": ("camera_0",)}
+    for model, more, error, words in (
+        (person, {"hold": {"head_y": 1.0}}, SettingsError, "leave hold out"),
+        (person, {"start": Path("start.csv")}, SettingsError, "leave start out"),
+        (bundled_model("hand"), {}, ModelError, r"left_ankle.*landmarks\.yaml"),
+        (person, alone, SceneError, "two or more calibrated cameras"),
+    ):
+        with pytest.raises(error, match=words):
+            estimate_scene(recording.folder, model, out, EstimateSettings(method="person", **more))
     assert not out.exists()

@@ -1,3 +1,4 @@
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,20 +14,21 @@ from drake_pose.files.settings import EpisodeSettings, EstimateSettings
 from drake_pose.input_files import read_csv
 from drake_pose.jobs.estimate.inputs import make_tree
 from drake_pose.jobs.estimate.measurements import (
-    check_units,
-    frame_times,
-    has_times,
     is_episode,
     left_out_warnings,
     read_joint_centres,
     read_measured_positions,
     timed_positions,
 )
-from drake_pose.silhouette.pictures.scenes import find_images, load_scene
+from drake_pose.silhouette.pictures.scenes import load_scene
 from tests.camera.recordings import write_video
 from tests.jobs.masks.rooms import moving, write_pictures
 from tests.jobs.scenes import NAMES
 
+ABC = SimpleNamespace(
+    position_names=("a", "b", "c"), position_kinds=("length",) * 3, couplings=(),
+    lower=np.full(3, -np.inf), upper=np.full(3, np.inf), is_unlimited_angle=np.zeros(3, bool),
+)  # fmt: skip
 CENTRES = "frame,joint,x,y,z\n0,ankle,1,2,3\n0,knee,4,5,6\n7,ankle,-1,-2,-3\n"
 
 
@@ -66,16 +68,15 @@ def test_damaged_joint_centres(tmp_path, text, message):
 
 def test_measured_positions_are_read_by_frame(tmp_path):
     path = written(tmp_path / "angles.csv", "frame,b,a\n3,0.5,-1\n")
-    truth = read_measured_positions(path, ["a", "b", "c"])
+    truth = read_measured_positions(path, ABC)
     assert truth.names == ("b", "a")
-    assert truth.of("0003").tolist() == [0.5, -1.0]
-    assert truth.of("0004") is None
-    assert truth.of("still") is None
+    assert truth.of_frames(["0003"]).tolist() == [[0.5, -1.0]]
+    assert np.isnan(truth.of_frames(["0004", "still"])).all()
     # Too long for a number: compared as a name.
     long = written(path, f"frame,b\n{'9' * 5000},0\n")
-    assert read_measured_positions(long, ["b"]).of("9") is None
+    assert read_measured_positions(long, ABC).by_frame.get(9) is None
     with pytest.raises(UnknownNameError, match=r"angles.csv.*'d'.*a, b, c"):
-        read_measured_positions(written(path, "frame,b,d\n3,0.5,-1\n"), ["a", "b", "c"])
+        read_measured_positions(written(path, "frame,b,d\n3,0.5,-1\n"), ABC)
 
 
 @pytest.mark.parametrize(("sign", "name"), [(";", "semicolons"), ("\t", "tabs")])
@@ -85,51 +86,50 @@ def test_tables_with_other_separators_are_refused_by_name(tmp_path, sign, name):
         read_csv(file, SceneError)
 
 
-def units_of(name: str, *values: float) -> tuple[str, ...]:
-    """Of an angle of -1 to 2 rad, a length of 0.1 to 0.3 m, or an angle without limits."""
-    limited = SimpleNamespace(
-        lower=np.array([-1.0, 0.1, -np.inf]), upper=np.array([2.0, 0.3, np.inf]),
-        position_kinds=("angle", "length", "angle"), position_index=("bend", "reach", "turn").index,
-    )  # fmt: skip
-    known = {f"{k}": np.array([value]) for k, value in enumerate(values)}
-    return check_units(Path("t.csv"), limited, [name], known)
-
-
-@pytest.mark.parametrize(
-    ("name", "values", "told"),
-    [
-        ("bend", (0.0, 2.09, -1.09), None), ("bend", (0.0, 2.11), "frame 1: 2.11 rad lies outside"),
-        ("bend", (-1.2, 0.0), "-1.2 rad lies outside the joint's limits, -1 to 2 rad; check"),
-        ("reach", (0.1, 0.319, 0.081), None), ("reach", (0.2, 0.33), "0.33 m lies outside"),
-        ("turn", (99.0,), None),
-        ("bend", (0.0, 7.0), "a full turn off, 0.7168 rad, it would not"),
-        ("bend", (-6.9,), "a full turn off, -0.6168 rad, it would not"),
-        ("bend", (4.0,), "check the column's joint"),
-        # The worst of several.
-        ("bend", (2.3, 2.9, -1.2), "frame 1: 2.9 rad"),
-        # Out of reach in any unit.
-        ("reach", (0.2, 200.0), "200 m lies outside"),
-        ("bend", (0.0, 300.0), "300 rad lies outside"),
-    ],
+MODEL = SimpleNamespace(
+    position_names=("bend", "swing", "reach", "turn"),
+    position_kinds=("angle", "angle", "length", "angle"),
+    lower=np.array([-1.0, -2.0, 0.1, -3.1]), upper=np.array([2.0, 2.0, 0.3, 3.1]),
+    is_unlimited_angle=np.array([False, False, False, True]), couplings=(),
 )  # fmt: skip
-def test_positions_outside_their_limits_are_told(name, values, told):
-    found = units_of(name, *values)
-    assert len(found) == (told is not None)
-    assert all(f"t.csv: column '{name}', " in text and told in text for text in found)
 
 
 @pytest.mark.parametrize(
-    ("name", "values", "told"),
+    ("columns", "rows", "scale", "told"),
     [
-        ("bend", (30.0, 90.0), "not in degrees: .* write every angle in radians"),
-        ("reach", (150.0, 290.0), "not in millimetres: .* write every length in metres"),
-        ("bend", (1.1e6,), "too large for a joint position"),
-        ("turn", (-2e6,), "too large for a joint position"),
+        ("bend", [[0.0], [2.09], [-1.09]], 1.0, None),
+        ("bend", [[0.0], [2.11]], 1.0, "gives 2.11 rad in frame 1, outside the joint's limits"),
+        ("bend", [[-1.2], [0.0]], 1.0, "limits -1 to 2: is it the wrong column"),
+        ("reach", [[0.1], [0.319], [0.081]], 1.0, None),
+        ("reach", [[0.2], [0.33]], 1.0, "gives 0.33 m in frame 1"),
+        ("turn", [[99.0]], 1.0, None),
+        ("bend", [[0.0], [7.0]], 1.0, "a full turn off, 0.7168, it would not"),
+        ("bend", [[-6.9]], 1.0, "a full turn off, -0.6168, it would not"),
+        # The worst of several.
+        ("bend", [[2.3], [2.9], [-1.2]], 1.0, "2.9 rad in frame 1"),
+        # Out of reach in any unit.
+        ("reach", [[0.2], [200.0]], 1.0, "gives 200 m in frame 1"),
+        ("bend", [[0.0], [300.0]], 1.0, "gives 300 rad in frame 1"),
+        ("bend,swing", [[30.0, 9.0], [90.0, -80.0]], np.pi / 180, "assumed to be in deg"),
+        ("reach", [[150.0], [290.0]], 1e-3, "assumed to be in mm"),
+        ("Bend.pos", [[0.5], [-0.9]], 1.0, "assumed to be in rad"),
+        ("bend.pos,swing.pos", [[0.2, 0.3]], None, "could be radians or degrees"),
+        ("bend,reach", [[0.1, np.nan]], None, "column 'reach', frame 0: nan is no joint"),
+        ("turn", [[-2e6]], None, "column 'turn', frame 0: -2e.06 is no joint position"),
     ],
 )
-def test_columns_in_other_units_are_refused(name, values, told):
-    with pytest.raises(SceneError, match=told):
-        units_of(name, *values)
+def test_tables_are_in_radians_and_metres_unless_limits_tell_another_unit(
+    tmp_path, columns, rows, scale, told
+):
+    lines = [f"{k},{','.join(map(str, row))}" for k, row in enumerate(rows)]
+    path = written(tmp_path / "t.csv", "\n".join([f"frame,{columns}", *lines]))
+    if scale is None:
+        with pytest.raises(SceneError, match=told):
+            read_measured_positions(path, MODEL)
+        return
+    found = read_measured_positions(path, MODEL)
+    np.testing.assert_allclose(found.positions, scale * np.array(rows), atol=1e-12)
+    assert told in found.warnings[0] if told else found.warnings == ()
 
 
 def test_a_table_of_estimates_is_read_with_its_base(tmp_path):
@@ -137,24 +137,26 @@ def test_a_table_of_estimates_is_read_with_its_base(tmp_path):
     base, fit = ",".join(BASE_COLUMNS), ",".join(FIT_COLUMNS)
     numbers = ",".join(str(k) for k in range(7))
     text = f"frame,a,b,{base},{fit}\n0,1,2,{numbers},0.1,3\n1,,,{',' * 6},,3\n"
-    found = read_measured_positions(written(tmp_path / "poses.csv", text), ("a", "b", "c"))
+    found = read_measured_positions(written(tmp_path / "poses.csv", text), ABC)
     assert found.names == ("a", "b")
-    assert [*found.values] == [0]
-    np.testing.assert_array_equal(found.of("0000"), [1.0, 2.0])
-    assert found.of("0001") is None
+    assert [*found.by_frame] == [0]
+    np.testing.assert_array_equal(found.by_frame[0], [1.0, 2.0])
+    assert 1 not in found.by_frame
     np.testing.assert_array_equal(found.bases[0], np.arange(7.0))
     assert found.is_estimate
     plain = read_measured_positions(
-        written(tmp_path / "p.csv", f"frame,a,{fit}\n0,1,0.1,3\n2,4,nan,3\n"), ("a", "b")
+        written(tmp_path / "p.csv", f"frame,a,{fit}\n0,1,0.1,3\n2,4,nan,3\n"), ABC
     )
-    assert (plain.names, plain.bases, [*plain.values]) == (("a",), {}, [0])
-    alone = read_measured_positions(written(tmp_path / "q.csv", "frame,b\n3,4\n"), ("a", "b"))
+    assert (plain.names, plain.bases, [*plain.by_frame]) == (("a",), None, [0])
+    alone = read_measured_positions(written(tmp_path / "q.csv", "frame,b\n3,4\n"), ABC)
     assert (alone.names, alone.is_estimate) == (("b",), False)
-    for bad, told in (("frame\n", "first line"), ("time,a\n", "first"), ("frame,a,a\n", "twice")):
+    for bad, told in (
+        ("frame\n", "expected"),
+        ("time,a\n0,1\n", "first"),
+        ("frame,a,a\n0,1,1\n", "it has"),
+    ):
         with pytest.raises(SceneError, match=told):
-            read_measured_positions(written(tmp_path / "bad.csv", bad), ("a",))
-    assert has_times(written(tmp_path / "t.csv", "time,a\n0,1\n"))
-    assert not has_times(tmp_path / "q.csv")
+            read_measured_positions(written(tmp_path / "bad.csv", bad), ABC)
 
 
 def test_a_folder_is_an_episode_unless_it_has_masks(tmp_path, monkeypatch):
@@ -169,6 +171,10 @@ def test_a_folder_is_an_episode_unless_it_has_masks(tmp_path, monkeypatch):
     monkeypatch.setattr("drake_pose.jobs.estimate.measurements.recording_format", lambda _: "")
     (tmp_path / "masks").rmdir()
     assert not is_episode(tmp_path, settings)
+    monkeypatch.undo()
+    for name, expected in (("images", True), ("masks", False)):
+        (tmp_path / name).mkdir()
+        assert is_episode(tmp_path, settings) == expected
     told = left_out_warnings(["a", "b"], {"a"})
     assert len(told) == 1
     assert "camera 'b' has no X_WC" in told[0]
@@ -182,6 +188,7 @@ def test_a_table_with_times_is_read_at_the_times_of_the_pictures(tmp_path):
     written(filmed.folder / "scene.yaml", "sequence: true\nframe_rate_hz: 10\n")
     write_video(film / "videos/front.mp4", range(8), 0.2 + 0.1 * np.arange(8))
     written(film / "scene.yaml", "sequence: true")
+    shutil.rmtree(filmed.folder / "masks")
     cameras = load_cameras(filmed.folder / "cameras.yaml")
     tree = make_tree(load_model(filmed.model), EstimateSettings())
     for path, late in ((filmed.folder, 0.0), (filmed.folder, 0.2), (film, 0.2)):
@@ -189,16 +196,15 @@ def test_a_table_with_times_is_read_at_the_times_of_the_pictures(tmp_path):
             stamped = [f"{k:04d},{late + 0.1 * k}" for k in range(8)]
             table = path / "images" / "front" / "timestamps.csv"
             written(table, "\n".join(["frame,time", *stamped]))
-        times = frame_times(replace(load_scene(path, cameras), images=find_images(path, ["front"])))
-        np.testing.assert_allclose([*times.values()], late + 0.1 * np.arange(8), atol=1e-6)
-        found, _, warnings = timed_positions(start, times, tree, EpisodeSettings())
+        scene = load_scene(path, cameras)
+        np.testing.assert_allclose(scene.times, late + 0.1 * np.arange(8), atol=1e-6)
+        found, _, warnings = timed_positions(start, scene, tree, EpisodeSettings())
         expected = np.radians(20.0 * (late + 0.1 * np.arange(8))[:, None] * [1.0, -2.0])
-        np.testing.assert_allclose([found.values[k] for k in range(8)], expected, atol=1e-6)
+        np.testing.assert_allclose([found.by_frame[k] for k in range(8)], expected, atol=1e-6)
         assert any("assumed to be in deg" in text for text in warnings)
     with pytest.raises(SceneError, match="has times, but those of the pictures are not known"):
-        timed_positions(start, {"0": np.nan}, tree, EpisodeSettings())
+        timed_positions(start, replace(scene, times=np.zeros(0)), tree, EpisodeSettings())
     frames = [f"{k},{9 - k},{0.1 * k},0" for k in range(8)]
     written(start, "\n".join([f"frame,time,{NAMES[0]},{NAMES[1]}", *frames[::-1]]))
-    times = {f"{k:04d}": 0.0 for k in range(8)}
-    found, _, _ = timed_positions(start, times, tree, EpisodeSettings())
-    np.testing.assert_allclose([found.values[k][0] for k in range(8)], 0.1 * np.arange(8))
+    found, _, _ = timed_positions(start, scene, tree, EpisodeSettings())
+    np.testing.assert_allclose([found.by_frame[k][0] for k in range(8)], 0.1 * np.arange(8))

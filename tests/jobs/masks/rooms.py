@@ -41,7 +41,3 @@ def moving(count=40):
     """Return joint angles [deg] of a moving crane."""
     t = np.linspace(0.0, 4.0 * np.pi, count)
     return np.column_stack([60.0 * np.sin(t), -60.0 + 50.0 * np.cos(1.7 * t)])
-
-
-def iou(one, other):
-    return np.count_nonzero(one & other) / max(1, np.count_nonzero(one | other))

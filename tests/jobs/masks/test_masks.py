@@ -10,27 +10,21 @@ import pytest
 from pycocotools import mask as coco
 
 from drake_pose import MaskSettings, load_scene, make_masks
-from drake_pose.errors import (
-    CameraError,
-    DrakePoseError,
-    MaskError,
-    OutputError,
-    SceneError,
-)
+from drake_pose.errors import CameraError, DrakePoseError, MaskError, OutputError, SceneError
 from drake_pose.jobs.masks import doubt_mask, largest_patch, refuse_mask
-from tests.camera.recordings import numbered, write_video
+from drake_pose.silhouette.pictures.masks import intersection_over_union
+from tests.camera.recordings import numbered, write_film, write_video
 from tests.camera.test_data_sets import LENGTHS, write_v21
 from tests.cli import run_json, run_to_end
-from tests.jobs.masks.rooms import iou, moving, write_pictures
+from tests.jobs.masks.rooms import moving, write_pictures
 from tests.jobs.scenes import write_scene
 
 
 @pytest.fixture(scope="module")
 def filmed(tmp_path_factory):
     """Pictures of a moving crane by two cameras; shared, do not change them."""
-    return write_pictures(
-        tmp_path_factory.mktemp("filmed") / "scene", moving(), ("front", "side")
-    ).folder
+    folder = tmp_path_factory.mktemp("filmed") / "scene"
+    return write_pictures(folder, moving(), ("front", "side")).folder
 
 
 @pytest.fixture
@@ -52,13 +46,14 @@ def agreement(made, filmed, moves=False):
         still = np.logical_and.reduce(list(masks.values())) & moves
         for frame in true.frames:
             if (camera, frame) in found.masks:
-                values.append(iou(masks[frame] & ~still, found.read(camera, frame) & ~still))
+                pair = masks[frame] & ~still, found.read(camera, frame) & ~still
+                values.append(intersection_over_union(*pair))
     return np.array(values)
 
 
 def test_background_beside_the_pictures_is_used(filmed, pictures, out):
     result = make_masks(pictures, out)
-    assert result.count == 80
+    assert result.summary["mask_count"] == 80
     assert agreement(out, filmed).mean() > 0.88
     assert filecmp.cmp(out / "cameras.yaml", filmed / "cameras.yaml", shallow=False)
     overlay = cv2.imread(str(out / "overlay" / "side" / "0003.jpg"))
@@ -141,10 +136,8 @@ def write_coco(path, scene, annotate, paths="{camera}/{frame}.jpg"):
         name = paths.format(camera=camera, frame=frame)
         images.append({"id": k, "file_name": name, "width": mask.shape[1], "height": mask.shape[0]})
         for number, segmentation in annotate(mask):
-            annotations.append(
-                {"id": len(annotations), "image_id": k, "category_id": number,
-                 "segmentation": segmentation}
-            )  # fmt: skip
+            own = {"id": len(annotations), "category_id": number, "segmentation": segmentation}
+            annotations.append(own | {"image_id": k})
     names = [{"id": 3, "name": "arm"}, {"id": 4, "name": "tool"}]
     content = {"images": images, "annotations": annotations, "categories": names}
     path.write_text(json.dumps(content))
@@ -161,7 +154,7 @@ def test_coco_run_lengths_become_the_same_masks(tmp_path, out, two_views):
     file = write_coco(tmp_path / "a.json", scene, halves)
     cameras = two_views.folder / "cameras.yaml"
     result = make_masks(file, out, MaskSettings(classes=("arm", "4"), cameras=cameras))
-    assert (result.count, result.warnings) == (6, ())
+    assert (result.summary["mask_count"], result.warnings) == (6, ())
     found = load_scene(out)
     assert set(found.masks) == set(scene.masks)
     assert all((found.read(*key) == scene.read(*key)).all() for key in scene.masks)
@@ -172,9 +165,47 @@ def test_coco_run_lengths_become_the_same_masks(tmp_path, out, two_views):
     assert not (tmp_path / "none").exists() or not any((tmp_path / "none").iterdir())
 
 
-def test_coco_polygons_without_cameras(tmp_path, out, two_views):
+@pytest.mark.parametrize(
+    ("paths", "warning"),
+    [
+        ("a9b8c7{frame[3]}f-{camera}_{frame}.jpg", ""),
+        ("{camera}/{frame[3]}a{frame}9f8d.jpg", "frames' names have parts like random ones"),
+        ("{camera}/s2a3b_00000{frame}.jpg", ""),
+    ],
+)
+def test_names_that_tell_the_frames_and_others(tmp_path, out, two_views, paths, warning):
     scene = load_scene(two_views.folder)
-    file = write_coco(tmp_path / "a.json", scene, lambda _: [(3, [POLYGON])])
+    file = write_coco(tmp_path / "a.json", scene, lambda _: [(3, [POLYGON])], paths)
+    content = json.loads(file.read_text())
+    for one in content["images"][::2]:
+        one["file_name"] = one["file_name"].replace("9", "c")
+    content["images"].reverse()
+    file.write_text(json.dumps(content))
+    result = make_masks(file, out, MaskSettings(cameras=scene.path / "cameras.yaml"))
+    assert bool(warning) == bool(result.warnings)
+    assert all(warning in text for text in result.warnings)
+    found = {name: [*own] for name, own in result.summary["cameras"].items()}
+    assert [len(own) for own in found.values()] == [3, 3]
+    if paths.startswith("a9b8"):
+        assert found == {key: [*scene.frames] for key in ("side", "front")}
+
+
+@pytest.mark.parametrize("name", ["result.json", "annotations/default.json", "train/_coco.json"])
+def test_exported_folders_are_sources(tmp_path, out, two_views, name):
+    scene, export = load_scene(two_views.folder), tmp_path / "export"
+    for folder in (export / "images/default", (export / name).parent):
+        folder.mkdir(parents=True, exist_ok=True)
+    cv2.imwrite(str(export / "images/default/0.png"), numbered(0))
+    if name.startswith("train"):
+        (export / "images").rename(export / "train/images")
+    write_coco(export / name, scene, lambda _: [(3, [POLYGON])])
+    result = make_masks(export, out, MaskSettings(cameras=scene.path / "cameras.yaml"))
+    assert set(load_scene(out).masks) == set(scene.masks)
+    assert result.warnings == ()
+
+
+def test_coco_polygons_without_cameras(tmp_path, out, two_views):
+    file = write_coco(tmp_path / "a.json", load_scene(two_views.folder), lambda _: [(3, [POLYGON])])
     result = make_masks(file, out)
     assert "there is no cameras.yaml" in result.warnings[0]
     mask = cv2.imread(str(out / "masks" / "side" / "0001.png"), cv2.IMREAD_GRAYSCALE)
@@ -188,7 +219,7 @@ def test_pictures_without_the_object_are_named(tmp_path, out, two_views):
     count = iter(range(6))
     file = write_coco(tmp_path / "a.json", scene, lambda _: [(3, [POLYGON])] if next(count) else [])
     result = make_masks(file, out, MaskSettings(cameras=scene.path / "cameras.yaml"))
-    assert result.count == 5
+    assert result.summary["mask_count"] == 5
     assert "front/0000.jpg': the object is not found" in result.warnings[0]
     assert "0000" not in [path.stem for path in (tmp_path / "out/masks/front").iterdir()]
     empty = write_coco(tmp_path / "b.json", scene, lambda _: [])
@@ -206,9 +237,8 @@ def test_annotations_of_another_size_or_camera_are_refused(tmp_path, out, two_vi
     with pytest.raises(SceneError, match="has frame 0000 twice"):
         make_masks(file, out)
     content = json.loads(file.read_text())
-    content["images"] = [
-        {**one, "width": 100, "file_name": "side/3.png"} for one in content["images"]
-    ]
+    for one in content["images"]:
+        one |= {"width": 100, "file_name": f"side/{one['id']}.png"}
     file.write_text(json.dumps(content))
     with pytest.raises(SceneError, match=r"100 x 160 pixels.*camera 'side'.*200 x 160"):
         make_masks(file, out, MaskSettings(cameras=cameras))
@@ -219,16 +249,10 @@ def test_annotations_of_another_size_or_camera_are_refused(tmp_path, out, two_vi
 def test_masks_in_a_video_become_a_sequence(tmp_path, out, two_views):
     scene = load_scene(two_views.folder)
     source = tmp_path / "source"
-    (source / "videos").mkdir(parents=True)
-    shutil.copy(scene.path / "cameras.yaml", source)
     for camera in scene.cameras:
-        path = str(source / "videos" / f"{camera}.avi")
-        video = cv2.VideoWriter(path, cv2.VideoWriter_fourcc(*"MJPG"), 25.0, (200, 160))
-        for frame in scene.frames:
-            video.write(
-                np.dstack([np.where(scene.read(camera, frame), 255, 0).astype(np.uint8)] * 3)
-            )
-        video.release()
+        masks = [np.where(scene.read(camera, frame), 255, 0) for frame in scene.frames]
+        write_film(source / "videos" / f"{camera}.avi", masks, 25.0)
+    shutil.copy(scene.path / "cameras.yaml", source)
     make_masks(source, out)
     made = load_scene(out)
     assert made.sequence
@@ -243,10 +267,8 @@ def test_an_episode_of_a_data_set_is_a_source(tmp_path, out):
         make_masks(tmp_path, out, MaskSettings(background="median"))
     result = make_masks(tmp_path, out, MaskSettings(background="median", episode=1))
     frames = [f"{k:06d}" for k in range(LENGTHS[1])]
-    assert {name: [*own] for name, own in result.summary["cameras"].items()} == {
-        "top": frames,
-        "wrist": frames,
-    }
+    found = {name: [*own] for name, own in result.summary["cameras"].items()}
+    assert found == {"top": frames, "wrist": frames}
     assert (out / "scene.yaml").read_text() == "frame_rate_hz: 10.0\nsequence: true\n"
 
 

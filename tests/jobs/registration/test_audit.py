@@ -11,18 +11,14 @@ import pytest
 
 from drake_pose.camera.camera_files import save_cameras
 from drake_pose.camera.models import Camera
-from drake_pose.errors import (
-    CameraError,
-    DrakePoseError,
-    MaskError,
-    SettingsError,
-)
+from drake_pose.errors import CameraError, DrakePoseError, MaskError, SettingsError
 from drake_pose.jobs.registration.audit import SceneAudit, audit_scene
-from drake_pose.jobs.registration.audit_page import corrected
+from drake_pose.jobs.registration.result import corrected
 from drake_pose.registration.findings import Finding
 from tests.cli import Result, run_to_end
 from tests.files.test_report_page import require_plain_page
 from tests.jobs.registration.arm_scenes import JOINTS, ArmScene, write_arm_scene
+from tests.registration.arm_pictures import shifted
 from tests.written_files import write_mask
 
 
@@ -99,7 +95,7 @@ class TestAudit:
         assert "1 of 8 frames is an outlier: 0002." in answer
         rows = re.findall(r"<tr>(.*?)</tr>", text, re.S)
         (elbow,) = (row for row in rows if row.startswith("<td>elbow_turn</td>"))
-        low, high = map(float, re.search(r"\(([-+.\d]+) to ([-+.\d]+) deg\)", elbow).groups())
+        low, high = map(float, re.search(r" deg \(([-+.\d]+) to ([-+.\d]+)\)", elbow).groups())
         assert low < -2.0 < high
         assert high - low < 1.0
         for name, least in summary["minimum_detectable"].items():
@@ -113,9 +109,7 @@ class TestAudit:
     def test_wrong_camera_pose_is_found(self, audited, tmp_path: Path) -> None:
         """The given pose of one camera is off by 2 cm."""
         left = audited.cameras["left"]
-        X_WC = left.X_WC.copy()
-        X_WC[:3, 3] += 0.02 * X_WC[:3, 0]
-        moved = {**audited.cameras, "left": left.with_pose(X_WC)}
+        moved = {**audited.cameras, "left": shifted(left, *(0.02 * left.X_WC[:3, 0]))}
         result = audit_with(audited, moved, tmp_path)
         named = [(one["what"], one["name"]) for one in result.summary["findings"]]
         assert named == [("camera", "left"), ("frame", "0002")]
@@ -140,22 +134,6 @@ class TestAudit:
         own.edit_cameras("left", X_WC=None)
         with pytest.raises(CameraError, match=r"'left'.*drake-pose register"):
             audit_scene(own.folder, own.model, own.joints)
-
-    @pytest.mark.parametrize(
-        ("spoil", "match", "text"),
-        [
-            (lambda X: X @ np.diag([1.0, -1.0, -1.0, 1.0]), "body behind it", "OpenGL"),
-            (lambda X: X * np.array([1.0, 1.0, 1.0, 1e3]), "check X_WC", "in millimetres"),
-        ],
-    )
-    def test_camera_that_cannot_show_the_robot(self, audited, tmp_path, spoil, match, text):
-        cameras = {
-            name: one.with_pose(np.vstack([spoil(one.X_WC)[:3], [0.0, 0.0, 0.0, 1.0]]))
-            for name, one in audited.cameras.items()
-        }
-        result = audit_with(audited, cameras, tmp_path)
-        assert re.search(match, " ".join(result.warnings))
-        assert text in " ".join(one["text"] for one in result.summary["findings"])
 
     def test_unexplained_and_empty_masks(self, audited, tmp_path: Path) -> None:
         own, nothing = audited.copy(tmp_path), np.zeros((240, 320), bool)
@@ -187,6 +165,6 @@ def test_corrected_values_are_the_true_ones() -> None:
     )
     for values, error in logged:
         found = corrected(values, names, replace(nothing, **error))
-        np.testing.assert_allclose(found[0], truth)
+        np.testing.assert_allclose(found, truth)
     for kind in ("camera", "base", "unexplained", "clock"):
-        assert corrected(truth, names, replace(nothing, kind=kind)) == ()
+        np.testing.assert_array_equal(corrected(truth, names, replace(nothing, kind=kind)), truth)

@@ -33,7 +33,7 @@ def change_rows(change: Callable[[list[list[str]]], object]) -> Spoil:
 
 def add_column(rows: list[list[str]]) -> None:
     for k, row in enumerate(rows):
-        row.append("time" if k == 0 else str(k))
+        row.append("brake" if k == 0 else str(k))
 
 
 def to_next(rows: list[list[str]]) -> None:
@@ -58,7 +58,7 @@ def edit(name: str, **fields: object) -> Spoil:
 BEFORE_WORK: dict[str, tuple[Spoil, list[str]]] = {
     "no table": (lambda s: s.joints.unlink(), ["joints.csv: cannot read it"]),
     "a column of no joint": (
-        change_rows(add_column), ["joints.csv has an unknown column", "'time'", "turret_turn"],
+        change_rows(add_column), ["joints.csv has an unknown column", "'brake'", "turret_turn"],
     ),
     "a frame without row": (
         change_rows(lambda r: r.pop(3)), ["joints.csv", "'0002'", "camera 'left'", "--frame"],
@@ -78,7 +78,7 @@ BEFORE_WORK: dict[str, tuple[Spoil, list[str]]] = {
         edit("left", focal_x=1e5, focal_y=1e5), ["camera 'left'", "100000 pixels", "degrees"],
     ),
     "a position that is none": (
-        change_rows(lambda r: r[2].__setitem__(2, "1e308")), ["joints.csv", "frame 1", "too large"],
+        change_rows(lambda r: r[2].__setitem__(2, "1e308")), ["joints.csv", "frame 1", "no joint"],
     ),
     "no focal length": (edit("left", focal_x=None), ["camera 'left'", "needs focal_x"]),
     "all cameras stand": (

@@ -1,31 +1,20 @@
 """Exports of `register --export`, read by the programs they are for."""
 
-import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
 
 import mujoco
 import numpy as np
 import pytest
-import yaml
 from pydrake.common.yaml import yaml_dump, yaml_load, yaml_load_typed
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.sensors import CameraConfig
 
-from drake_pose.camera.camera_files import load_cameras
+from drake_pose.camera.camera_files import load_camera_file
 from drake_pose.camera.models import ParallelCamera
 from drake_pose.errors import CameraError, SettingsError
 from drake_pose.files.settings import RegistrationSettings
-from drake_pose.jobs.registration.result import check_exports, write_exports
-
-TEXTS = ("ros", "mujoco", "drake")
-
-
-@pytest.fixture(scope="module")
-def written(arm_scene, tmp_path_factory):
-    """Exports of the arm's two true cameras."""
-    folder = tmp_path_factory.mktemp("exports")
-    inputs = arm_scene.read()
-    write_exports(folder, TEXTS, inputs, arm_scene.cameras.values(), {})
-    return folder
+from drake_pose.jobs.registration.result import export_texts, write_exports
 
 
 def drake_cameras(path):
@@ -37,34 +26,41 @@ def drake_cameras(path):
     }
 
 
-def test_drake_and_load_cameras_read_the_scenario(written, arm_scene):
-    cameras, configs = load_cameras(written / "drake.yaml"), drake_cameras(written / "drake.yaml")
-    assert list(cameras) == list(configs) == list(arm_scene.cameras)
-    for name, camera in arm_scene.cameras.items():
-        np.testing.assert_allclose(
-            cameras[name].kernel_parameters(), camera.kernel_parameters(), rtol=1e-12
-        )
-        X_PB = configs[name].X_PB.GetDeterministicValue().GetAsMatrix4()
-        np.testing.assert_allclose(X_PB, camera.X_WC, atol=1e-12)
-        color, _ = configs[name].MakeCameras()
-        assert color.core().intrinsics().center_x() == pytest.approx(camera.center_x + 0.5)
-
-
-def test_mujoco_and_ros_have_all_cameras(written, arm_scene):
-    text = f'<mujoco><worldbody><include file="{written}/mujoco.xml"/></worldbody></mujoco>'
-    model = mujoco.MjModel.from_xml_string(text)
+def test_a_camera_on_a_link_stands_there_in_mujoco_and_drake(tmp_path, arm_scene):
+    """At joint positions of which the camera's pose in the world depends."""
+    cameras, links = arm_scene.cameras, {"left": "hand"}
+    write_exports(tmp_path, ["mujoco", "drake"], arm_scene.read(), cameras.values(), links)
+    plant = MultibodyPlant(0.0)
+    Parser(plant).AddModels(str(arm_scene.model))
+    plant.Finalize()
+    context = plant.CreateDefaultContext()
+    spec = mujoco.MjSpec.from_file(str(arm_scene.model))
+    spec.compiler.fusestatic, spec.compiler.boundmass, spec.compiler.boundinertia = False, 1, 1
+    text = f'<mujoco><worldbody><include file="{tmp_path}/mujoco.xml"/></worldbody></mujoco>'
+    exported = mujoco.MjSpec.from_string(text)
+    for body in exported.worldbody.bodies:
+        spec.body(body.name).add_frame().attach_body(body, "of_", "")
+    model = spec.compile()
     data = mujoco.MjData(model)
+    for k in range(model.njnt):
+        plant.GetJointByName(model.joint(k).name).set_angle(context, 0.3 + 0.1 * k)
+        data.joint(k).qpos[:] = 0.3 + 0.1 * k
     mujoco.mj_forward(model, data)
-    launch = ElementTree.parse(written / "ros" / "static_transforms.launch.xml").getroot()
-    assert len(launch) == model.ncam == len(arm_scene.cameras)
-    for node, (name, camera) in zip(launch, arm_scene.cameras.items(), strict=True):
-        place = data.camera(name)
-        np.testing.assert_allclose(place.xpos, camera.X_WC[:3, 3], atol=1e-12)
-        R_WC = place.xmat.reshape(3, 3) * [1.0, -1.0, -1.0]
-        np.testing.assert_allclose(R_WC, camera.X_WC[:3, :3], atol=1e-9)
-        info = yaml.safe_load((written / "ros" / f"{name}.yaml").read_text())
-        assert info["camera_matrix"]["data"][2] == camera.center_x
-        assert "--frame-id world " in node.get("args")
+    X_WC = (
+        plant.GetFrameByName("hand").CalcPoseInWorld(context).GetAsMatrix4() @ cameras["left"].X_WC
+    )
+    place = data.camera("of_left")
+    np.testing.assert_allclose(place.xpos, X_WC[:3, 3], atol=1e-9)
+    np.testing.assert_allclose(place.xmat.reshape(3, 3) * [1, -1, -1], X_WC[:3, :3], atol=1e-9)
+    X_PB = drake_cameras(tmp_path / "drake.yaml")["left"].X_PB
+    frame = plant.GetFrameByName(X_PB.base_frame)
+    X_WP = frame.CalcPoseInWorld(context).GetAsMatrix4()
+    X_WB = X_WP @ X_PB.GetDeterministicValue().GetAsMatrix4()
+    np.testing.assert_allclose(X_WB, X_WC, atol=1e-9)
+    for name in ("mujoco.xml", "drake.yaml"):
+        read = load_camera_file(tmp_path / name)
+        assert read.links == links
+        np.testing.assert_allclose(read.cameras["left"].X_WC, cameras["left"].X_WC, atol=1e-9)
 
 
 def test_transforms_start_at_the_link_at_the_world_s_origin(tmp_path, arm_scene):
@@ -90,9 +86,9 @@ def test_transforms_start_at_the_link_at_the_world_s_origin(tmp_path, arm_scene)
 
 def test_unsupported_exports_are_refused_before_work():
     flat = ParallelCamera("flat", 64, 48, 50.0, 31.5, 23.5, np.eye(4))
-    for name in TEXTS:
+    for name in ("ros", "mujoco", "drake"):
         with pytest.raises(CameraError, match=r"'flat'.*parallel"):
-            check_exports([name], [flat])
-    check_exports([], [flat])
+            export_texts([name], [flat], "world", {})
+    export_texts([], [flat], "world", {})
     with pytest.raises(SettingsError, match="no export 'gazebo'; there is: ros"):
         RegistrationSettings(exports=("gazebo",))

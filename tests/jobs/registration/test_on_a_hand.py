@@ -80,7 +80,7 @@ def test_camera_and_target_are_found(looks, links, alike, tmp_path, out):
     assert millimetres < min(1.0, 4.0 * np.sqrt(3.0) * target["translation_sd_mm"])
     assert degrees < 0.2
     assert found["mean_iou"] > 0.98
-    assert "The target stands at" in (out / "report.html").read_text()
+    assert "Target in the robot&#39;s world" in (out / "report.html").read_text()
     assert yaml.safe_load((out / "registration.yaml").read_text())["wrist"]["target"] == target
 
 

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from drake_pose.errors import RegistrationError, SettingsError
 from drake_pose.files.settings import RegistrationSettings
+from drake_pose.jobs.registration.audit import audit_scene
 from drake_pose.jobs.registration.register import register_scene
 from drake_pose.registration.hand_eye import motion
 from tests.benchmarks.registration import pose_error
@@ -93,11 +94,8 @@ def write_episode(folder: Path, swing: tuple[float, ...], objects: int = 150) ->
 
 @pytest.mark.slow
 def test_a_wrist_camera_is_found_over_things_on_a_table(tmp_path):
-    scene = write_episode(tmp_path / "scene", SWING)
-    settings = RegistrationSettings(on="link5")
-    result = register_scene(
-        scene, write_arm(tmp_path / "arm.urdf"), out=tmp_path / "out", settings=settings
-    )
+    scene, arm = write_episode(tmp_path / "scene", SWING), write_arm(tmp_path / "arm.urdf")
+    result = register_scene(scene, arm, out=tmp_path / "out")  # Its link is found, too.
     found = result.registered["wrist"]
     off = pose_error(found.camera.X_WC, X_LC)
     assert np.linalg.norm(off[:3]) < np.radians(0.5)
@@ -108,7 +106,14 @@ def test_a_wrist_camera_is_found_over_things_on_a_table(tmp_path):
     assert one["explained"] > 2.0 * one["explained_by_chance"]
     assert yaml.safe_load((tmp_path / "out/cameras.yaml").read_text())["wrist"]["link"] == "link5"
     assert list((tmp_path / "out/overlay/wrist").glob("*.png"))
-    assert "points that fit" in (tmp_path / "out/report.html").read_text()
+    assert "Circles: points of the scene" in (tmp_path / "out/report.html").read_text()
+    file = yaml.safe_load((tmp_path / "out/cameras.yaml").read_text())
+    for off, names in ((0.0, []), (0.05, ["wrist"])):
+        file["wrist"]["X_LC"][0][3] = float(found.camera.X_WC[0, 3]) + off
+        (given := tmp_path / "given.yaml").write_text(yaml.safe_dump(file))
+        audit = audit_scene(scene, arm, out=tmp_path / f"audit{off}", cameras=given).audit
+        assert [one.name for one in audit.common] == names
+        assert sum(one.shift for one in audit.common) == pytest.approx(off)
 
 
 @pytest.mark.parametrize(

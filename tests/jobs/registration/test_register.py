@@ -40,7 +40,8 @@ class TestRegister:
         # All of this arm turns with its first joint.
         (said,) = found["warnings"]
         assert "relative to the zero of joint 'turret_turn'" in said
-        assert result.stderr == f"drake-pose: warning: {said}\n"
+        assert found["warning_weights"] == ["note"]
+        assert result.stderr == f"drake-pose: note: {said}\n"
         # The camera file is readable for an estimate.
         written = load_scene(arm_scene.folder, load_cameras(out / "cameras.yaml")).cameras
         assert list(written) == ["left", "right"]
@@ -83,8 +84,8 @@ class TestRegister:
         assert max(wrong) < 0.005
         page = (registered[0] / "report.html").read_text()
         answer = require_plain_page(page, registered[1]["warnings"]).by_id["answer"]
-        assert answer.startswith("Camera found, with a standard deviation of ")
-        assert answer.endswith("0 of 5 frames are outliers.")
+        assert answer.startswith("Camera left found, good to ")
+        assert answer.endswith("All 5 frames agree.")
         assert page.count("data:image/jpeg;base64,") == page.count("<tr><td>000") == 5
         assert not (registered[0] / "overlay_as_given").exists()
         for name in ("cameras.yaml", "registration.yaml", "summary.json", "overlay/left/0003.png"):

@@ -5,12 +5,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from drake_pose.jobs.registration.result import (
-    make_registration_report,
-    plot_offset,
-)
+from drake_pose.jobs.registration.pages import registration_page
 from drake_pose.jobs.registration.tracks import describe_pictures
 from drake_pose.registration.recording import TimeOffset
+from tests.files.test_report_page import require_plain_page
 from tests.search.arms import arm_cameras
 
 
@@ -29,24 +27,27 @@ def summary(**camera):
 
 
 @pytest.mark.parametrize("late", [0.1, -0.35])
-def test_time_offset_is_drawn_at_the_peak_of_the_scores(tmp_path, late):
+def test_time_offset_is_told_beside_the_scores(tmp_path, late):
     offsets = np.linspace(-1.0, 1.0, 81)
-    # Two offsets have not been scanned.
-    scores = np.column_stack([offsets, 1.0 - 0.3 * np.abs(offsets - late)])[
-        [*range(5), *range(7, 81)]
-    ]
+    scores = np.column_stack([offsets, 1.0 - 0.3 * np.abs(offsets - late)])
     told = {"time_offset_s": late, "time_offset_sd_s": 0.02, "focal_sd_px": 5.0}
-    page = make_registration_report(tmp_path, summary(time_offset_scores=scores.tolist(), **told))
-    assert f"{1e3 * late:.1f} ms ({1e3 * late - 39.2:.1f} to {1e3 * late + 39.2:.1f})" in page
-    assert f" {abs(1e3 * late):.0f} ms {'later' if late > 0 else 'earlier'}" in page
-    assert "Focal length 500.0 pixels (490.2 to 509.8)" in page
-    assert page.count('<img class="plot" src="data:image/') == 1
-    (axes,) = plot_offset({"time_offset_scores": scores.tolist(), **told}).axes
-    curve, line = (one.get_xydata() for one in axes.lines)
-    np.testing.assert_allclose(curve, scores * [1e3, 100.0])
-    np.testing.assert_allclose(line[:, 0], curve[curve[:, 1].argmax(), 0], atol=1e-9)
-    band = axes.patches[0].get_extents().transformed(axes.transData.inverted())
-    assert (band.x0, band.x1) == pytest.approx((1e3 * late - 39.2, 1e3 * late + 39.2))
+    registration_page(tmp_path, summary(time_offset_scores=scores.tolist(), **told)).write(tmp_path)
+    page = require_plain_page((tmp_path / "report.html").read_text())
+    text = "".join(page.plots["front"].itertext())
+    assert f"{1e3 * late:.1f} ms ({1e3 * late - 39.2:.1f} to {1e3 * late + 39.2:.1f})" in text
+    assert f" {abs(1e3 * late):.0f} ms {'later' if late > 0 else 'earlier'}" in text
+    assert "Focal length 500.0 pixels (490.2 to 509.8)" in text
+
+
+def test_a_camera_on_a_link_without_masks_has_no_unknown_numbers(tmp_path):
+    fit = {"agrees": True, "E_total": None, "iou": None, "inlier_ratio": 0.8}
+    one = summary(masks="none", points=9, link="hand", X_LC=np.eye(4).tolist(), mean_iou=None)
+    del one["cameras"]["front"]["time_offset_scores"]
+    one["cameras"]["front"]["frames"] = {"0000": fit}
+    registration_page(tmp_path, one).write(tmp_path)
+    page = require_plain_page((tmp_path / "report.html").read_text())
+    assert page.table("camera")[1][1:3] == ["link hand", "0.0, 0.0, 0.0 mm"]
+    assert page.table("frame")[1] == ["0000", "no mask", "no mask", "80.0 %", "agrees"]
 
 
 def test_summary_of_time_offset_focal_length_and_runner_up(tmp_path):

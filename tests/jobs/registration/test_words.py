@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -10,9 +11,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from drake_pose.body import load_model
 from drake_pose.errors import RegistrationError
-from drake_pose.files.overlay import EXCESS_RGB
+from drake_pose.files.overlay import EXCESS_RGB, body_drawer
 from drake_pose.fit.judge import PairedEvidence
 from drake_pose.jobs.registration.diagnosis import (
     compare_camera,
@@ -20,9 +20,7 @@ from drake_pose.jobs.registration.diagnosis import (
     lack_of_evidence,
     require_determined,
 )
-from drake_pose.jobs.registration.result import (
-    body_drawer,
-)
+from drake_pose.jobs.registration.register import register_scene
 from drake_pose.jobs.registration.tracks import draw_tracks
 from drake_pose.jobs.registration.words import (
     common_outlier_warnings,
@@ -34,16 +32,13 @@ from drake_pose.registration.findings import Finding
 from drake_pose.registration.picture_matches import Sightings
 from drake_pose.registration.posed_frames import PosedFrame
 from drake_pose.registration.recording import Recording, TimeOffset
-from drake_pose.registration.register import (
-    FrameMisfit,
-    RegisteredCamera,
-    RegistrationBody,
-)
+from drake_pose.registration.register import FrameMisfit, RegisteredCamera, RegistrationBody
 from drake_pose.silhouette.outline import outline_from_mesh
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.scoring import draw_mask
-from tests.registration.arm_pictures import looking_at
-from tests.search.arms import arm_cameras, arm_urdf
+from tests.jobs.registration.arm_scenes import write_arm_scene
+from tests.registration.arm_pictures import looking_at, shifted
+from tests.search.arms import arm_cameras, arm_tree
 
 DEGREE = np.radians(1.0)
 
@@ -103,39 +98,51 @@ def test_frames_that_fit_other_rows_are_no_evidence() -> None:
 
 
 @pytest.mark.parametrize(
-    ("left", "right", "said"),
+    ("left", "right", "misplaced", "said"),
     [
-        # 1: an inlier, 0: an outlier, 2: an inlier that fits worse.
-        ("1000", "101", ["frames 1 .* all cameras", "frames 2 .* in camera"]),
-        ("11101", "11111", ["frames 3 .*'left'.* are right"]),
-        ("11101", "11121", ["check their joint positions"]),
-        ("11100", "00011", ["no common frame: 'left' .*0-2, 'right' .*3-4"]),
-        ("11100", "00111", [".*"]),
-        ("1000", "", []),
+        # 1: an inlier, 0: an outlier.
+        ("1000", "101", "", ["frames 1 .* all cameras.*masks", "frames 2 .* in camera 'left'"]),
+        ("1000", "101", "1", ["frames 1 .* all cameras.*correct theirs", "frames 2 .*'left'"]),
+        ("11101", "11111", "", ["frames 3 .*'left'.* are right"]),
+        ("11101", "11111", "3", ["frames 3 .*'left'.*correct theirs"]),
+        ("11100", "00011", "", ["no common frame: 'left' .*0-2, 'right' .*3-4", "", ""]),
+        ("1000", "", "", []),
     ],
 )
-def test_outliers_of_several_cameras_are_distinguished(left, right, said) -> None:
+def test_outliers_of_several_cameras_are_distinguished(left, right, misplaced, said) -> None:
     cameras = []
     for name, agreeing in (("left", left), ("right", right)):
-        one = registered(*(0.9 if k != "0" else -0.9 for k in agreeing))
-        errors = [0.08 if k == "2" else 0.02 for k in agreeing]
-        frames = [replace(k, E_total=E) for k, E in zip(one.frames, errors, strict=True)]
-        cameras.append(replace(one, camera=replace(one.camera, name=name), frames=tuple(frames)))
-    texts = common_outlier_warnings(cameras if right else cameras[:1])
-    assert len(texts) >= len(said)
-    assert all(re.search(part, text) for part, text in zip(said, texts, strict=False))
-    assert any("no common frame" in text for text in texts) == ({left, right} == {"11100", "00011"})
+        one = registered(*(0.9 if k == "1" else -0.9 for k in agreeing))
+        cameras.append(replace(one, camera=replace(one.camera, name=name)))
+    texts = common_outlier_warnings(cameras if right else cameras[:1], misplaced=misplaced)
+    for part, text in zip(said, texts, strict=True):
+        assert re.search(part, text)
+
+
+def test_wrong_rows_are_told_from_bad_masks(tmp_path: Path) -> None:
+    """Frames 2 and 6 have each other's positions; of frame 4 half the mask is missing."""
+    scene = write_arm_scene(tmp_path, count=12, seed=3)
+    rows = scene.rows()
+    rows[3][1:], rows[7][1:] = rows[7][1:], rows[3][1:]
+    scene.write_rows(rows)
+    path = scene.folder / "masks" / "left" / "0004.png"
+    mask = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    mask[:, : int(np.median(np.nonzero(mask)[1]))] = 0
+    cv2.imwrite(str(path), mask)
+    told, *_ = register_scene(scene.folder, scene.model, scene.joints).warnings
+    assert "explain 0004: check their masks" in told
+    assert "explain 0002, 0006 better: are their joint positions" in told
 
 
 def test_poses_that_are_not_determined_are_refused() -> None:
     """By the largest deviation about, or along, any axis."""
     turn = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
-    for turned, shifted, told in (
+    for turned, moved, told in (
         (0.039, 0.039, None), (0.05, 0.01, "of 2.9 degrees and 10 mm"), (0.01, 0.05, "and 50 mm"),
     ):  # fmt: skip
         C = np.zeros((6, 6))
         C[:3, :3] = turn @ np.diag([1e-6, turned**2, 1e-6]) @ turn.T
-        C[3:, 3:] = turn @ np.diag([1e-6, 1e-6, shifted**2]) @ turn.T
+        C[3:, 3:] = turn @ np.diag([1e-6, 1e-6, moved**2]) @ turn.T
         one = replace(registered(0.9, 0.9), covariance=C)
         if told is None:
             require_determined(one)
@@ -146,17 +153,13 @@ def test_poses_that_are_not_determined_are_refused() -> None:
 
 @pytest.fixture(scope="module")
 def body(tmp_path_factory: pytest.TempPathFactory) -> RegistrationBody:
-    path = tmp_path_factory.mktemp("arm") / "arm.urdf"
-    path.write_text(arm_urdf())
-    return RegistrationBody(load_model(path, check=False).pose_tree())
+    return RegistrationBody(arm_tree(tmp_path_factory.mktemp("arm")))
 
 
 def test_a_given_camera_is_compared_by_its_covariance(body: RegistrationBody) -> None:
     """The motion is that of points of the robot in its pictures, clipped at a diagonal."""
     given = arm_cameras()[0]
-    X_WC = given.X_WC.copy()
-    X_WC[:3, 3] += [0.003, 0.0, 0.004]
-    found = replace(registered(0.9, 0.9), camera=given.with_pose(X_WC))
+    found = replace(registered(0.9, 0.9), camera=shifted(given, 0.003, 0.0, 0.004))
     values = np.array([[0.1, 0.2, 0.3, 0.4, 0.5], [0.5, 0.0, 0.0, 0.3, 0.1]])
     for alone in (True, False):
         one = compare_camera(body, given, found, values, alone)
@@ -280,14 +283,13 @@ def test_several_poses_name_the_joint_that_tells_them_apart_best(body: Registrat
 
 def test_bodies_are_drawn_with_the_index_of_the_shown_node(body: RegistrationBody) -> None:
     camera, values = arm_cameras()[0], np.array([0.1, 0.4, 0.3, 0.5, 0.2])
-    frame = PosedFrame("0", values, np.ones((240, 320), bool))
     names = [node.name for node in body.tree.nodes]
-    every = body_drawer(body.tree, None)(camera, frame)
+    every = body_drawer(body.tree, None)(camera, values)
     X_CN = camera.X_CW @ body.kinematics.poses(values)
     outlines = [outline_from_mesh(node.mesh) for node in body.tree.nodes]
     np.testing.assert_array_equal(every >= 0, draw_mask(outlines, X_CN, camera))
     assert {*np.unique(every)} == {-1, *range(len(names))}
-    some = body_drawer(body.tree, names[2:])(camera, frame)
+    some = body_drawer(body.tree, names[2:])(camera, values)
     np.testing.assert_array_equal(some >= 0, draw_mask(outlines[2:], X_CN[2:], camera))
     # A node keeps its place among those shown.
     np.testing.assert_array_equal((every >= 2) & (some != every - 2), np.zeros_like(every, bool))

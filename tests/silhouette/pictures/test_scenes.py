@@ -70,9 +70,9 @@ def test_every_second_frame_halves_the_frame_rate(tmp_path):
         whole.every(0, [])
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
+def test_invalid_settings_are_refused(tmp_path):
+    make_scene(tmp_path)
+    for text, message in (
         ("sequence: maybe", "sequence"),
         ("frame_rate_hz: 0", "frame_rate_hz"),
         ("frame_rate_hz: .inf", "frame_rate_hz"),
@@ -81,13 +81,10 @@ def test_every_second_frame_halves_the_frame_rate(tmp_path):
         ("speed: 3", "unknown field speed"),
         ("- 1", "mapping"),
         ("{", "not a YAML file"),
-    ],
-)
-def test_invalid_settings_are_refused(tmp_path, text, message):
-    make_scene(tmp_path)
-    (tmp_path / "scene.yaml").write_text(text)
-    with pytest.raises(SceneError, match=rf"scene\.yaml: .*{message}"):
-        load_scene(tmp_path)
+    ):
+        (tmp_path / "scene.yaml").write_text(text)
+        with pytest.raises(SceneError, match=rf"scene\.yaml: .*{message}"):
+            load_scene(tmp_path)
 
 
 def test_flat_mask_folder_needs_one_camera(tmp_path):

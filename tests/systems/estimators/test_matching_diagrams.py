@@ -142,13 +142,15 @@ def test_the_mask_player_plays_frame_by_frame(tmp_path, chain):
 
 @pytest.mark.parametrize("system", [SilhouetteMatcher, SilhouetteTracker])
 def test_invalid_settings_are_refused(chain, system):
-    search = search_for(chain)
-    with pytest.raises(SettingsError, match="period"):
-        system(search, [front_camera()], 0.0)
-    with pytest.raises(SettingsError, match="cameras"):
-        system(search, [], PERIOD)
-    with pytest.raises(SettingsError, match=r"front.*front"):
-        system(search, [front_camera(), front_camera()], PERIOD)
+    search, camera = search_for(chain), front_camera()
+    for given, said in (
+        ((search, [camera], 0.0), "period"),
+        ((search, [], PERIOD), "cameras"),
+        ((search, [camera, camera], PERIOD), r"front.*front"),
+        ((chain.pose_tree(), [camera], PERIOD), r"needs a search, as MultiStartSearch\(tree\)"),
+    ):
+        with pytest.raises(SettingsError, match=said):
+            system(*given)
 
 
 def test_pose_sets_are_output(tmp_path):

@@ -12,7 +12,7 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.sensors import CameraConfig, RgbdSensor
 
 from drake_pose.body import ArticulatedModel
-from drake_pose.errors import CameraError, SettingsError, UnknownNameError
+from drake_pose.errors import CameraError, UnknownNameError
 from drake_pose.search import PaperSearch, PaperSearchSettings
 from drake_pose.systems.cameras import cameras_from_drake
 from drake_pose.systems.silhouette_matcher import SilhouetteMatcher, SilhouetteTracker
@@ -87,9 +87,3 @@ def test_cameras_from_drake_equal_the_sensors(tmp_path):
     # The centre of Drake's image, whose pixel centres are at i + 0.5.
     assert (camera.center_x, camera.center_y, camera.focal_x) == (99.0, 99.0, 900.0)
     np.testing.assert_allclose(camera.X_WC, X_WC.GetAsMatrix4(), atol=1e-12)
-
-
-def test_a_tree_instead_of_a_search_is_refused(tmp_path):
-    tree = swinging_chain(tmp_path, 2).pose_tree()
-    with pytest.raises(SettingsError, match=r"needs a search, as MultiStartSearch\(tree\)"):
-        SilhouetteMatcher(tree, [front_camera()], 0.1)

@@ -13,6 +13,7 @@ from drake_pose.arrays import Array, Mask
 from drake_pose.camera.episode import JointLog
 from drake_pose.camera.models import check_number
 from drake_pose.camera.servo_readings import (
+    TURN,
     UNITS,
     Column,
     Encoding,
@@ -184,13 +185,13 @@ def find_unit(
     if size > most and servos is not None:
         # Only homed motors count below 0, or beyond a turn.
         first, last = (-1, 2) if all(one.motor for one in body) else (0, 1)
-        if all(first * known.turn <= end <= last * known.turn for one in body for end in one.ends):
+        if all(first * TURN <= end <= last * TURN for one in body for end in one.ends):
             return "steps", f"they are up to {size:.0f}"
     if size <= full and (is_named or is_arm):
-        unit, why = _servo_unit(body, known.turn)
+        unit, why = _servo_unit(body)
         if in_rad and is_moved and why.startswith("but") and not (is_named and is_arm):
             return "rad", "as degrees or -100 ... 100 the robot would hardly move"
-        lacking = [one for one in body if range_in_steps(one, known.turn) is None]
+        lacking = [one for one in body if range_in_steps(one) is None]
         is_known = not lacking or known.is_so or known.is_dynamixel
         if unit == "normalised" and not (is_known and not (in_rad and why.startswith("but"))):
             fitting = ["radians"] * in_rad + ["degrees"] * in_deg
@@ -249,22 +250,22 @@ def _refuse_mixed(
         )
 
 
-def _servo_unit(body: Sequence[JointReadings], turn: int) -> tuple[Encoding, str]:
+def _servo_unit(body: Sequence[JointReadings]) -> tuple[Encoding, str]:
     """Return the unit of servos' readings of at most 100, "deg" or "normalised", and the reason.
 
     Encoders count in whole steps: a unit is right if readings are whole steps in it alone.
 
-    ``body``: the joints with finite readings. ``turn``: steps of a full turn.
+    ``body``: the joints with finite readings.
     """
     # The middle of a range may be half a step.
-    if are_whole([2.0 * (turn - 1) / 360.0 * one.readings for one in body]):
+    if are_whole([2.0 * (TURN - 1) / 360.0 * one.readings for one in body]):
         return "deg", "only as degrees they are whole steps of an encoder"
-    counts = [(one, range_in_steps(one, turn)) for one in body]
+    counts = [(one, range_in_steps(one)) for one in body]
     if are_whole([(one.readings + 100.0) * n / 200.0 for one, n in counts if n]):
         return "normalised", "only as -100 ... 100 of its range they are whole steps of an encoder"
     for one in body:
         if one.motor is not None and math.isfinite(one.motor.high):
-            half = 180.0 * (one.motor.high - one.motor.low) / turn
+            half = 180.0 * (one.motor.high - one.motor.low) / TURN
             if max(-one.ends[0], one.ends[1]) > half + 2.0:
                 return "normalised", f"as degrees '{one.column}' would leave its range"
     if any((np.abs(one.readings) == 100.0).any() for one in body):
@@ -275,12 +276,12 @@ def _servo_unit(body: Sequence[JointReadings], turn: int) -> tuple[Encoding, str
 def _servo_warning(servos: Servos, unit: Encoding, why: str) -> str:
     """Return the warning that readings are taken for those of LeRobot's motors in a unit."""
     source = "no calibration file of the robot is in or beside the data set"
-    source += f", so {servos.turn // 2} is taken for zero" if unit == "steps" else ""
+    source += f", so {TURN // 2} is taken for zero" if unit == "steps" else ""
     source = f"their ranges are those of {servos.path}" if servos.path else source
     what = {
         "normalised": "LeRobot's -100 ... 100 of the motors' ranges",
         "deg": "LeRobot's degrees",
-        "steps": f"encoder steps, {servos.turn} a turn",
+        "steps": f"encoder steps, {TURN} a turn",
     }[unit]
     return (
         f"readings of the joint log are taken to be {what}{': ' if why else ''}{why}; {source}; "

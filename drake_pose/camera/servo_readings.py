@@ -29,6 +29,9 @@ Encoding = Literal["rad", "deg", "normalised", "steps"]
 UNITS = {"rad": 1.0, "deg": math.pi / 180.0}
 """Units of angles [rad]."""
 
+TURN = 4096
+"""Steps of an encoder in a full turn, the same in all motors of LeRobot's arms."""
+
 
 class Motor(NamedTuple):
     """A motor's entry in a calibration file."""
@@ -50,8 +53,6 @@ class Servos:
     # By name of the motor; empty without a file.
     motors: Mapping[str, Motor] = field(default_factory=dict)
     has_lists: bool = False  # Whether the file is of the older kind.
-    # Steps of an encoder in a full turn, the same in all motors of LeRobot's arms.
-    turn: int = 4096
 
     @property
     def is_so(self) -> bool:
@@ -217,9 +218,7 @@ def are_whole(columns: Sequence[Array], near: float = 0.03, least: int = 8) -> b
     return all(bool((np.abs(one - np.round(one)) < near).all()) for one in told) if told else None
 
 
-def range_in_steps(
-    joint: JointReadings, turn: int, least: int = 300, different: int = 24
-) -> int | None:
+def range_in_steps(joint: JointReadings, least: int = 300, different: int = 24) -> int | None:
     """Return the length of a motor's range [steps], from calibration or normalised readings.
 
     Without a calibration it is the smallest length with which all readings are whole steps. None:
@@ -227,7 +226,6 @@ def range_in_steps(
 
     Args:
         joint: the joint.
-        turn: steps of a full turn.
         least: minimum length of a range [steps].
         different: minimum number of different readings; with fewer a length may fit by chance.
     """
@@ -236,7 +234,7 @@ def range_in_steps(
         return round(length) if math.isfinite(length) else None
     full = 100.0 if joint.is_gripper else 200.0
     shifted = np.unique(joint.readings[np.isfinite(joint.readings)]) + (full - 100.0)
-    found = (n for n in range(least, turn) if are_whole([shifted * n / full], least=different))
+    found = (n for n in range(least, TURN) if are_whole([shifted * n / full], least=different))
     return next(found, None)
 
 
@@ -283,16 +281,16 @@ def unit_columns(
         elif unit == "steps":
             column = _plain_column(joint, known, unit)
         elif unit == "normalised":
-            length = range_in_steps(joint, known.turn)
+            length = range_in_steps(joint)
             if length is None and joint.is_called(known.full_turns):
-                length = known.turn - 1
+                length = TURN - 1
             if length is None:
                 assumed.append(joint.name)
                 column = _between(joint, -100.0, 100.0)
             else:
-                half = math.pi * length / known.turn
-                ends = None if length >= known.turn - 1 else (-100.0, 100.0)
-                column = Column(joint.column, 0.01 * half, _zero(joint, length, known.turn), ends)
+                half = math.pi * length / TURN
+                ends = None if length >= TURN - 1 else (-100.0, 100.0)
+                column = Column(joint.column, 0.01 * half, _zero(joint, length), ends)
         if column is not None:
             columns[joint.name] = column
     if degrees:
@@ -360,22 +358,21 @@ def _opening_column(
     return plain, []
 
 
-def _spans_limits(joint: JointReadings, length: float, turn: int, alike: float = 0.25) -> bool:
+def _spans_limits(joint: JointReadings, length: float, alike: float = 0.25) -> bool:
     """Return whether the range of a joint's motor is about as long as the joint's limits.
 
-    ``length``: of the range [steps]. ``turn``: steps of a full turn. ``alike``: maximum difference
-    [the limits' length].
+    ``length``: of the range [steps]. ``alike``: maximum difference [the limits' length].
     """
     span = joint.upper - joint.lower
-    return abs(2.0 * math.pi * length / turn - span) <= alike * span < math.inf
+    return abs(2.0 * math.pi * length / TURN - span) <= alike * span < math.inf
 
 
-def _zero(joint: JointReadings, length: float, turn: int) -> float:
+def _zero(joint: JointReadings, length: float) -> float:
     """Return a joint's position [rad] in the middle of its motor's range, of a ``length`` [steps].
 
     It is 0 if the range tells nothing of the joint's limits.
     """
-    told = length < turn - 1 and _spans_limits(joint, length, turn)
+    told = length < TURN - 1 and _spans_limits(joint, length)
     return 0.5 * (joint.lower + joint.upper) if told else 0.0
 
 
@@ -397,7 +394,7 @@ def _as_counted(joint: JointReadings, servos: Servos, encoding: Encoding) -> Col
     """
     if encoding != "steps" or not servos.has_lists or joint.motor is None:
         return Column(joint.column)
-    scale = 360.0 / servos.turn
+    scale = 360.0 / TURN
     sign = -1.0 if joint.motor.is_inverted else 1.0
     return Column(joint.column, sign * scale, scale * joint.motor.homing)
 
@@ -407,13 +404,13 @@ def _plain_column(joint: JointReadings, servos: Servos, encoding: Encoding) -> C
 
     Without a calibration the zero of steps is half a turn.
     """
-    motor, turn = joint.motor, servos.turn
-    step = 2.0 * math.pi / turn if encoding == "steps" else math.radians(1.0)
+    motor = joint.motor
+    step = 2.0 * math.pi / TURN if encoding == "steps" else math.radians(1.0)
     if motor is None or not (encoding == "steps" or math.isfinite(motor.high)):
-        return Column(joint.column, step, -step * (turn // 2) if encoding == "steps" else 0.0)
-    zero = _zero(joint, motor.high - motor.low, turn)
+        return Column(joint.column, step, -step * (TURN // 2) if encoding == "steps" else 0.0)
+    zero = _zero(joint, motor.high - motor.low)
     if encoding == "deg":
-        return Column(joint.column, step * (turn - 1) / turn, zero)
+        return Column(joint.column, step * (TURN - 1) / TURN, zero)
     step = -step if motor.is_inverted and not servos.is_dynamixel else step
     return Column(joint.column, step, zero - step * (0.5 * (motor.low + motor.high)))
 
@@ -448,7 +445,7 @@ def _gripper_column(joint: JointReadings, servos: Servos, encoding: Encoding) ->
     If the motor's range is not about as long as the joint's limits, a gear is between them, and the
     range's ends are the limits. ``encoding``: of the other joints.
     """
-    motor, turn = joint.motor, servos.turn
+    motor = joint.motor
     length = math.nan if motor is None else motor.high - motor.low
     if encoding == "steps":
         if motor is None or not math.isfinite(length):
@@ -459,8 +456,8 @@ def _gripper_column(joint: JointReadings, servos: Servos, encoding: Encoding) ->
         low, high = 0.0, 100.0
         if not is_share(joint.readings, high):
             return None
-    if joint.is_angle and _spans_limits(joint, length, turn):
-        scale = 2.0 * math.pi * length / turn / (high - low)
+    if joint.is_angle and _spans_limits(joint, length):
+        scale = 2.0 * math.pi * length / TURN / (high - low)
         return Column(joint.column, scale, joint.lower - scale * low)
     return _between(joint, low, high)
 

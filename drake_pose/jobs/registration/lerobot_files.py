@@ -12,7 +12,7 @@ from drake_pose.camera.joint_map import motors_of
 from drake_pose.camera.lerobot import INFO, camera_name
 from drake_pose.camera.lerobot_tables import camera_fields
 from drake_pose.camera.models import Camera, PinholeCamera
-from drake_pose.camera.servo_readings import Column, Encoding, JointReadings, Servos
+from drake_pose.camera.servo_readings import TURN, Column, Encoding, JointReadings, Servos
 from drake_pose.errors import SettingsError
 from drake_pose.jobs.registration.inputs import RegistrationInputs
 
@@ -57,7 +57,7 @@ def correct_homing(
         most_lost: maximum correction [half the range]; beyond it the model's zero is not meant to
             be the motor's, as in a model whose limits are all on one side of 0.
     """
-    motor, step = servos.motors[motor_name], 2.0 * math.pi / servos.turn
+    motor, step = servos.motors[motor_name], 2.0 * math.pi / TURN
     before = motor.homing
     if joint.is_gripper:
         reason = "its readings are an opening of 0 to 100, not an angle"
@@ -79,9 +79,9 @@ def correct_homing(
         return HomingCorrection(motor_name, before, before, 0, reason)
     # Feetech: position = counted - homing offset; Dynamixel: plus.
     after = before + shift if servos.is_dynamixel else before - shift
-    if not servos.is_dynamixel and abs(after) >= servos.turn // 2:
+    if not servos.is_dynamixel and abs(after) >= TURN // 2:
         # The register has a sign and 11 bits; positions are modulo a turn.
-        after = max(after - int(math.copysign(servos.turn, after)), 1 - servos.turn // 2)
+        after = max(after - int(math.copysign(TURN, after)), 1 - TURN // 2)
     return HomingCorrection(motor_name, before, after, shift)
 
 

@@ -3,7 +3,6 @@
 import math
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast, get_args
 
@@ -25,7 +24,6 @@ from drake_pose.camera.servo_readings import (
     is_of_servos,
     is_share,
     name_words,
-    range_in_steps,
     unit_columns,
 )
 from drake_pose.errors import CameraError, SceneError, SettingsError, require_known
@@ -165,10 +163,10 @@ def find_unit(
 
     Raises SceneError: the readings fit no unit, or several equally well.
     """
-    body = [one for one in joints if one.is_angle and not one.is_gripper]
+    angles = [one for one in joints if one.is_angle]
     body = [
-        replace(one, readings=one.readings[np.isfinite(one.readings)])
-        for one in body or [one for one in joints if one.is_angle]
+        one
+        for one in [one for one in angles if not one.is_gripper] or angles
         if np.isfinite(one.readings).any() and (usual is None or one.upper - one.lower < math.inf)
     ]
     if not body:
@@ -191,7 +189,7 @@ def find_unit(
         unit, why = _servo_unit(body)
         if in_rad and is_moved and why.startswith("but") and not (is_named and is_arm):
             return "rad", "as degrees or -100 ... 100 the robot would hardly move"
-        lacking = [one for one in body if range_in_steps(one) is None]
+        lacking = [one for one in body if one.steps is None]
         is_known = not lacking or known.is_so or known.is_dynamixel
         if unit == "normalised" and not (is_known and not (in_rad and why.startswith("but"))):
             fitting = ["radians"] * in_rad + ["degrees"] * in_deg
@@ -255,13 +253,12 @@ def _servo_unit(body: Sequence[JointReadings]) -> tuple[Encoding, str]:
 
     Encoders count in whole steps: a unit is right if readings are whole steps in it alone.
 
-    ``body``: the joints with finite readings.
+    ``body``: joints with readings.
     """
     # The middle of a range may be half a step.
     if are_whole([2.0 * (TURN - 1) / 360.0 * one.readings for one in body]):
         return "deg", "only as degrees they are whole steps of an encoder"
-    counts = [(one, range_in_steps(one)) for one in body]
-    if are_whole([(one.readings + 100.0) * n / 200.0 for one, n in counts if n]):
+    if are_whole([(one.readings + 100.0) * one.steps / 200.0 for one in body if one.steps]):
         return "normalised", "only as -100 ... 100 of its range they are whole steps of an encoder"
     for one in body:
         if one.motor is not None and math.isfinite(one.motor.high):

@@ -14,6 +14,7 @@ import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -31,6 +32,9 @@ UNITS = {"rad": 1.0, "deg": math.pi / 180.0}
 
 TURN = 4096
 """Steps of an encoder in a full turn, the same in all motors of LeRobot's arms."""
+
+LEAST_RANGE, LEAST_READINGS = 300, 24
+"""Minimum of a range [steps], and of different readings, fewer of which fit a range by chance."""
 
 
 class Motor(NamedTuple):
@@ -194,11 +198,28 @@ class JointReadings:
         """Return whether the column's or the joint's name ends with one of the names."""
         return self.column.removesuffix(".pos").endswith(names) or self.name.endswith(names)
 
-    @property
+    @cached_property
     def ends(self) -> tuple[float, float]:
         """The smallest and the largest reading; 0 and 0 without readings."""
         known = self.readings[np.isfinite(self.readings)]
         return (float(known.min()), float(known.max())) if known.size else (0.0, 0.0)
+
+    @cached_property
+    def steps(self) -> int | None:
+        """Length of its motor's range [steps], from calibration or normalised readings.
+
+        Without a calibration it is the smallest length with which all readings are whole steps.
+        None: it is not known.
+        """
+        if self.motor is not None:
+            length = self.motor.high - self.motor.low
+            return round(length) if math.isfinite(length) else None
+        full = 100.0 if self.is_gripper else 200.0
+        shifted = np.unique(self.readings[np.isfinite(self.readings)]) + (full - 100.0)
+        for length in range(LEAST_RANGE, TURN):
+            if are_whole([shifted * length / full], least=LEAST_READINGS):
+                return length
+        return None
 
     def excess(self, scale: float, most: float = np.inf) -> float:
         """Return by how much readings times a scale exceed the limits, or plus and minus most."""
@@ -216,26 +237,6 @@ def are_whole(columns: Sequence[Array], near: float = 0.03, least: int = 8) -> b
     different = [np.unique(column[np.isfinite(column)]) for column in columns]
     told = [one for one in different if len(one) >= least]
     return all(bool((np.abs(one - np.round(one)) < near).all()) for one in told) if told else None
-
-
-def range_in_steps(joint: JointReadings, least: int = 300, different: int = 24) -> int | None:
-    """Return the length of a motor's range [steps], from calibration or normalised readings.
-
-    Without a calibration it is the smallest length with which all readings are whole steps. None:
-    it is not known.
-
-    Args:
-        joint: the joint.
-        least: minimum length of a range [steps].
-        different: minimum number of different readings; with fewer a length may fit by chance.
-    """
-    if joint.motor is not None:
-        length = joint.motor.high - joint.motor.low
-        return round(length) if math.isfinite(length) else None
-    full = 100.0 if joint.is_gripper else 200.0
-    shifted = np.unique(joint.readings[np.isfinite(joint.readings)]) + (full - 100.0)
-    found = (n for n in range(least, TURN) if are_whole([shifted * n / full], least=different))
-    return next(found, None)
 
 
 def unit_columns(
@@ -281,7 +282,7 @@ def unit_columns(
         elif unit == "steps":
             column = _plain_column(joint, known, unit)
         elif unit == "normalised":
-            length = range_in_steps(joint)
+            length = joint.steps
             if length is None and joint.is_called(known.full_turns):
                 length = TURN - 1
             if length is None:
@@ -394,9 +395,8 @@ def _as_counted(joint: JointReadings, servos: Servos, encoding: Encoding) -> Col
     """
     if encoding != "steps" or not servos.has_lists or joint.motor is None:
         return Column(joint.column)
-    scale = 360.0 / TURN
-    sign = -1.0 if joint.motor.is_inverted else 1.0
-    return Column(joint.column, sign * scale, scale * joint.motor.homing)
+    scale, motor = 360.0 / TURN, joint.motor
+    return Column(joint.column, -scale if motor.is_inverted else scale, scale * motor.homing)
 
 
 def _plain_column(joint: JointReadings, servos: Servos, encoding: Encoding) -> Column:
@@ -445,17 +445,15 @@ def _gripper_column(joint: JointReadings, servos: Servos, encoding: Encoding) ->
     If the motor's range is not about as long as the joint's limits, a gear is between them, and the
     range's ends are the limits. ``encoding``: of the other joints.
     """
-    motor = joint.motor
+    motor, low, high = joint.motor, 0.0, 100.0
     length = math.nan if motor is None else motor.high - motor.low
     if encoding == "steps":
         if motor is None or not math.isfinite(length):
             return None
         is_reversed = motor.is_inverted and not servos.is_dynamixel
         low, high = (motor.high, motor.low) if is_reversed else (motor.low, motor.high)
-    else:
-        low, high = 0.0, 100.0
-        if not is_share(joint.readings, high):
-            return None
+    elif not is_share(joint.readings, high):
+        return None
     if joint.is_angle and _spans_limits(joint, length):
         scale = 2.0 * math.pi * length / TURN / (high - low)
         return Column(joint.column, scale, joint.lower - scale * low)

@@ -8,7 +8,7 @@ import json
 import math
 import os
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -103,15 +103,15 @@ def open_folder(path: Path, joints: JointLog | None) -> Episode:
     calibration = CameraFile({}, ())
     if (path / CAMERAS).exists():
         calibration = load_camera_file(path / CAMERAS, distorted=True)
-    names = [one.name for one in sorted(path.glob("images/*")) if one.is_dir()]
+    names = [*calibration.cameras]
+    names += [one.name for one in sorted(path.glob("images/*")) if one.is_dir()]
     names += [one.stem for one in sorted(path.glob("videos/*")) if one.suffix.lower() in VIDEOS]
     cameras = []
-    for name in dict.fromkeys([*calibration.cameras, *names]):
-        files = find_recorded_files(path, name)
+    recorded = {name: find_recorded_files(path, name) for name in dict.fromkeys(names)}
+    for name, files in recorded.items():
         if isinstance(files, dict):
-            camera, camera_warnings = _image_camera(
-                name, path / "images" / name, path / "scene.yaml", joints
-            )
+            files = files or find_pictures(path / "images" / name, name)
+            camera, camera_warnings = _image_camera(name, files, path / "scene.yaml", joints)
         elif files is not None:
             video = Video(files)
             camera, camera_warnings = video_camera(name, video), video.warnings
@@ -128,7 +128,7 @@ def open_folder(path: Path, joints: JointLog | None) -> Episode:
             )
         cameras.append(add_calibration(camera, calibration, path / CAMERAS))
     if joints is not None and joints.times is not None and not joints.frames:
-        is_video = [isinstance(find_recorded_files(path, one.name), Path) for one in cameras]
+        is_video = [isinstance(recorded[one.name], Path) for one in cameras]
         if all(is_video) and not any(
             joints.times[0] <= one.times[-1] and one.times[0] <= joints.times[-1] for one in cameras
         ):
@@ -162,29 +162,28 @@ def _times_of_rows(joints: JointLog, frames: Sequence[str]) -> Array:
 
 
 def _image_camera(
-    name: str, folder: Path, scene: Path, joints: JointLog | None
+    name: str, files: Mapping[str, Path], scene: Path, joints: JointLog | None
 ) -> tuple[Stream, list[str]]:
-    """Return a camera whose images are in a folder, and warnings about incomplete frames.
+    """Return a camera by its image files by frame, and warnings about incomplete frames.
 
-    The times of its images are those of the folder's `timestamps.csv`, or else those of the same
+    The times of its images are those of their folder's `timestamps.csv`, or else those of the same
     frames in the joint log, or else follow from the frame rate in scene.yaml, or else are nan.
 
-    ``scene``: path of the scene.yaml, which may be missing. Raises SceneError: there is no image,
-    or a file is unusable.
+    ``scene``: path of the scene.yaml, which may be missing. Raises SceneError: a file is unusable.
     """
-    files, warnings = find_pictures(folder, name), list[str]()
+    warnings, stamps = list[str](), next(iter(files.values())).with_name(TIME_STAMPS)
     is_logged = joints is not None and joints.times is not None and bool(joints.frames)
     timed = picture_times(files, None if is_logged else read_sequence(scene)[1])
     if lacking := sorted(timed.keys() ^ files.keys()):
         warnings.append(
-            f"{folder / TIME_STAMPS}: {len(lacking)} frames have no picture, or no time, and are "
-            f"left out; the first is {lacking[0]}"
+            f"{stamps}: {len(lacking)} frames have no picture, or no time, and are left out; the "
+            f"first is {lacking[0]}"
         )
     frames = tuple(frame for frame in timed if frame in files)
     times = np.array([timed[frame] for frame in frames])
     kept = np.arange(len(frames))
     if np.isfinite(times).any():
-        kept, late = ascending_indices(times, str(folder / TIME_STAMPS))
+        kept, late = ascending_indices(times, str(stamps))
         warnings += late
     elif joints is not None and is_logged:
         times = _times_of_rows(joints, frames)

@@ -24,6 +24,7 @@ from drake_pose.camera.models import Camera, check_number
 from drake_pose.camera.picture_files import (
     Video,
     find_pictures,
+    frame_key,
     in_order,
     read_binary_mask,
     read_picture,
@@ -323,8 +324,6 @@ class RecordedSource(FrameSource):
                 text = f"frame{'s' if len(frames) > 1 else ''} {listed(frames)}"
                 self.drop(f"{where}: has no {what} of {text}", len(frames))
         timed = [frame for frame in times if frame in files]
-        if not timed:
-            raise SceneError(f"{stamped}: has no time of any picture in {folder}")
         steps = np.diff([times[frame] for frame in timed])
         if self.rate_hz is None and np.any(steps > 0):
             self.rate_hz = 1.0 / float(np.median(steps[steps > 0]))
@@ -361,12 +360,12 @@ def picture_times(
 ) -> dict[str, float]:
     """Return the times [s] of the frames of a folder of pictures by name, in order.
 
-    They are those of the folder's `timestamps.csv`, also of frames without a picture, in its order;
-    or else follow from the frames' natural order and rate, the first being 0; or else are nan.
+    They are those of the folder's `timestamps.csv` (7 is ``0007.png``), also of frames without a
+    picture, in its order; or else follow from natural order and rate, from 0 on; or else are nan.
 
     ``files``: picture files by frame. ``rate_hz``: frames per second; None: unknown. ``beside``:
     other frames that are counted. Raises SceneError: `timestamps.csv` lacks a column, has a frame
-    twice, or a time that is not a finite number.
+    twice, no picture's time, or a time that is not a finite number.
     """
     path = next(iter(files.values())).with_name(TIME_STAMPS)
     if not path.is_file():
@@ -375,9 +374,10 @@ def picture_times(
     header, rows = read_csv(path, SceneError)
     if not {"frame", "time"} <= set(header):
         raise SceneError(f"{path}: needs the columns frame and time [s] in its first line")
-    found: dict[str, float] = {}
+    found, named = dict[str, float](), {frame_key(frame): frame for frame in files}
     for line, row in rows:
         frame = row[header.index("frame")]
+        frame = frame if frame in files else named.get(frame_key(frame), frame)
         if frame in found:
             raise SceneError(f"{path}: line {line}: has frame {frame} twice")
         try:
@@ -386,6 +386,8 @@ def picture_times(
             found[frame] = math.nan
         if not math.isfinite(found[frame]):
             raise SceneError(f"{path}: line {line}: the time must be a number of seconds")
+    if not found.keys() & files.keys():
+        raise SceneError(f"{path}: has no time of any picture in its folder")
     return found
 
 

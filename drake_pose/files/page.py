@@ -184,12 +184,9 @@ def picture_files(
 
     ``places``: caption by path in the folder. ``side``: as of `picture`.
     """
-    existing = [name for name in places if (folder / name).is_file()][:most]
-    drawn = {
-        name: picture((folder / name).read_bytes(), places[name], quote(name), side)
-        for name in existing
-    }
-    return [(one, places[name], "") for name, one in drawn.items() if one]
+    names = [name for name in places if (folder / name).is_file()][:most]
+    files = [(picture((folder / x).read_bytes(), places[x], quote(x), side), x) for x in names]
+    return [(image, places[name], "") for image, name in files if image]
 
 
 def plot(

@@ -115,7 +115,8 @@ class ResultWriter:
             return
         self.records = {one.frame: one for one in self._table.read(earlier.get("frames"))}
         # Frames whose mask files have changed, or have no digest, are estimated again.
-        gone = [f for f, record in self.records.items() if self._digests(f) != record.masks]
+        known = {frame: mask_digests(scene, scene.cameras, frame) for frame in self.records}
+        gone = [frame for frame, digests in known.items() if digests != self.records[frame].masks]
         if others := set(gone) - set(frames):
             raise OutputError(
                 f"frame {frame_ranges(others, scene.frames)}: the masks were replaced since "
@@ -128,10 +129,6 @@ class ResultWriter:
                 f"frame {frame_ranges(gone, scene.frames)}: estimated again, as the masks were "
                 "replaced or not recorded"
             )
-
-    def _digests(self, frame: str) -> dict[str, str]:
-        """Return the digests of a frame's mask files by camera."""
-        return mask_digests(self.scene, self.scene.cameras, frame)
 
     def begin(self) -> None:
         """Write poses.csv and an incomplete summary.json before the first frame."""
@@ -161,7 +158,8 @@ class ResultWriter:
 
     def add(self, record: FrameRecord) -> None:
         """Append a frame's row to poses.csv, which marks it as finished; renew an old summary."""
-        self.records[record.frame] = replace(record, masks=self._digests(record.frame))
+        digests = mask_digests(self.scene, self.scene.cameras, record.frame)
+        self.records[record.frame] = replace(record, masks=digests)
         if self._table is not None:
             self._table.append(record)
         if time.monotonic() > self._next_summary:

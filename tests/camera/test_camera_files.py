@@ -112,16 +112,6 @@ def test_unreadable_and_unwritable_files_are_refused(tmp_path):
         save_cameras(tmp_path / "nowhere" / "c.yaml", [camera])
 
 
-def test_alias_bombs_are_refused_quickly(tmp_path):
-    lines = ["a0: &a0 [[1]]"]
-    lines += [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]" for i in range(1, 40)]
-    with pytest.raises(CameraError, match="a0"):
-        load_cameras(write(tmp_path, "\n".join(lines)))
-    lines = [f"cam: {{{SIDES}, focal_x: 1, focal_y: 1, X_WC: *a39}}", *lines]
-    with pytest.raises(CameraError):
-        load_cameras(write(tmp_path, "\n".join([*lines[1:], lines[0]])))
-
-
 FRONT = """
 name: front
 width: 320

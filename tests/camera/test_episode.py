@@ -102,7 +102,7 @@ def test_images_are_matched_by_frame_or_by_time(tmp_path):
     both = open_episode(tmp_path, joints=table)
     np.testing.assert_array_equal(both.camera("a").times, [7.5, 8.0, 9.0])
     np.testing.assert_array_equal(both.joints.positions[:, 0], [0.0, np.nan, 1.0])
-    stamps.write_text("frame,time\n10,3.5\n9,3.75\n7,4\n")
+    stamps.write_text("frame,time\n010,3.5\n9,3.75\n7,4\n")
     timed = open_episode(tmp_path, joints=table)
     np.testing.assert_array_equal(timed.camera("a").times, [3.5, 3.75])
     assert number_of(timed.camera("a").read(0)) == 10

@@ -70,7 +70,7 @@ class TestFolder:
 
     def test_time_stamps_order_the_frames(self, tmp_path):
         folder = write_folder(tmp_path, ["9", "10", "11", "12", "extra"])
-        rows = ["9,0.0", "10,0.11", "11,0.11", "12,0.05", "13,0.4"]
+        rows = ["009,0.0", "10,0.11", "11,0.11", "12,0.05", "13,0.4"]
         (folder / "timestamps.csv").write_text("\n".join(["frame,time", *rows]) + "\n")
         source = open_source(specify(folder, rate_hz=None))
         assert source.rate_hz == pytest.approx(1 / 0.11)
@@ -122,6 +122,7 @@ class TestFolder:
             (["0"], {}, "frame,time\n0,soon\n", "line 2"),
             (["0"], {}, "frame,time\n0,1\n0,2\n", "frame 0 twice"),
             (["0"], {}, "frame,time\n1,1\n", "no time of any picture"),
+            (["0"], {}, "frame,time\n", "no time of any picture"),
         ],
     )
     def test_unusable_folders_are_refused(self, tmp_path, names, more, stamps, reason):

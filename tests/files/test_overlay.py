@@ -43,19 +43,6 @@ def test_borders_are_pixels_of_the_body_before_another_segment():
     assert count(paint_agreement(body, body), overlay.OUTLINE_RGB) == 0
 
 
-def test_a_large_overlay_is_cropped_to_the_body():
-    mask = rectangle((1900, 1100), slice(1000, 1600), slice(300, 600))
-    body = rectangle((1900, 1100), slice(1000, 1600), slice(310, 610))
-    picture = PALETTE[draw_overlay(mask, body, None, "title")]
-    assert max(picture.shape) < 900
-    for colour, columns in (
-        (overlay.MISSING_RGB, 10),
-        (overlay.EXCESS_RGB, 10),
-        (overlay.AGREEMENT_RGB, 290),
-    ):
-        assert count(picture, colour) >= 600 * columns
-
-
 def test_shapes_are_contours_over_the_silhouette():
     mask = rectangle((600, 600), slice(100, 500), slice(100, 500))
     first = rectangle((600, 600), slice(100, 500), slice(150, 450))

@@ -30,7 +30,7 @@ from drake_pose.camera.models import (
     check_pose,
 )
 from drake_pose.camera.picture_files import SUFFIXES, picture_size
-from drake_pose.camera.pose_files import Content, Entry, Parsed, Parser, same_camera
+from drake_pose.camera.pose_files import Content, Entry, Parsed, Parser, choose_frames
 from drake_pose.errors import CameraError, SceneError, listed
 from drake_pose.input_files import named_fields, read_regular, read_yaml
 
@@ -186,7 +186,7 @@ def _placed(path: Path, entries: Mapping[str, Entry], known: CameraFile | None) 
     """Return the known cameras at the poses of a file (``path``) that has no intrinsics.
 
     ``entries``: by the file's names. ``known``: by the recording's names; None: there are none.
-    Raises CameraError: there are no intrinsics, or no pose is one of a known camera.
+    Raises CameraError: there are no intrinsics, no pose is one of a known camera, or several are.
     """
     names = listed(sorted(entries))
     if known is None or not known.cameras:
@@ -196,17 +196,15 @@ def _placed(path: Path, entries: Mapping[str, Entry], known: CameraFile | None) 
             "camera_info or this program's cameras.yaml)"
         )
     own = [*known.cameras]
-    is_one = len(entries) == len(own) == 1
-    meant = {name: own[0] if is_one else same_camera(name, own) for name in entries}
-    found = {camera: entries[name] for name, camera in meant.items() if camera is not None}
-    if not found:
+    meant = choose_frames(entries, own, path)
+    if not meant:
         raise CameraError(
             f"{path}: has poses of {names}, but the recording's cameras are {listed(own)}: name "
             "them alike in the file, or name the one camera that it is for (--camera NAME)"
         )
     return {
-        name: one._replace(camera=known.cameras[name], lens=known.lenses.get(name))
-        for name, one in found.items()
+        name: entries[frame]._replace(camera=known.cameras[name], lens=known.lenses.get(name))
+        for name, frame in meant.items()
     }
 
 

@@ -32,7 +32,7 @@ from drake_pose.camera.picture_files import (
     naming_damage,
     read_picture,
 )
-from drake_pose.camera.pose_files import same_camera
+from drake_pose.camera.pose_files import choose_frames
 from drake_pose.camera.sources import CAMERAS, TIME_STAMPS, picture_times
 from drake_pose.errors import CameraError, SceneError, SettingsError, listed
 from drake_pose.input_files import (
@@ -251,20 +251,16 @@ def recorded_intrinsics(
         own = {one.name: one.camera for one in cameras if one.camera is not None}
         lenses = {one.name: one.lens for one in cameras if one.lens is not None}
         return CameraFile(dict(own), tuple(own), lenses=lenses)
-    found, lenses = dict[str, Camera](), dict[str, Lens]()
-    for name, given in read.cameras.items():
-        meant = same_camera(name, [one.name for one in cameras])
-        if len(read.cameras) == len(cameras) == 1:
-            meant = cameras[0].name
-        if meant is None or not isinstance(given, PinholeCamera):
-            continue
-        size = next((one.width, one.height) for one in cameras if one.name == meant)
-        alike = abs(size[0] * given.height - size[1] * given.width) <= max(size)
-        if name in read.lenses:
-            lenses[meant] = read.lenses[name]
-        elif alike:
+    found, lenses, streams = dict[str, Camera](), dict[str, Lens](), {c.name: c for c in cameras}
+    pinholes = {k: v for k, v in read.cameras.items() if isinstance(v, PinholeCamera)}
+    meant = choose_frames(pinholes, [*streams], intrinsics or path / CAMERAS)
+    for name, frame in meant.items():
+        given, size = pinholes[frame], (streams[name].width, streams[name].height)
+        if frame in read.lenses:
+            lenses[name] = read.lenses[frame]
+        elif abs(size[0] * given.height - size[1] * given.width) <= max(size):
             given = given.resized(*size)
-        found[meant] = replace(given, name=meant)
+        found[name] = replace(given, name=name)
     return CameraFile(found, tuple(found), lenses=lenses)
 
 

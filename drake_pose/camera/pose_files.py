@@ -7,7 +7,7 @@ import math
 import re
 import shlex
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from drake_pose.arrays import Array
 from drake_pose.camera.models import Camera, Lens, PinholeCamera, check_pose, inverse_pose, numbers
-from drake_pose.errors import CameraError
+from drake_pose.errors import CameraError, listed
 
 END_EFFECTOR = "end effector"
 """Link of a camera on the robot's end effector whose file does not name the link."""
@@ -291,8 +291,7 @@ def urdf(content: Content) -> Parsed:
     """Read the frames of a URDF model, on fixed joints, whose names say camera or optical.
 
     A frame may have the name of the recording's camera instead. A camera below a joint that moves
-    rides on that joint's link. Of several optical frames of one camera, that of its colours is
-    read.
+    rides on that joint's link.
     """
     robot = content.root("robot")
     if robot is None:
@@ -318,17 +317,12 @@ def urdf(content: Content) -> Parsed:
     inner = {frames[name][0] for name in named}
     seen = [name for name in named if "optical" in name or not words.search(name)]
     found = dict[str, Entry]()
-    for name in sorted(
-        seen or [name for name in named if name not in inner],
-        key=lambda name: ("color" in name or "rgb" in name, "optical" in name),
-        reverse=True,
-    ):
-        if short_name(name) not in map(short_name, found):
-            root, X = above(frames, name)
-            text = f"link '{name}' is read as the frame of the lens, x right, y down, z forward"
-            entry = Entry(X, root if root in moving else "", "" if words.search(name) else text)
-            is_turned = "optical" not in name and words.search(name) is not None
-            found[name] = optical(name, entry, is_turned=is_turned)
+    for name in seen or [name for name in named if name not in inner]:
+        root, X = above(frames, name)
+        text = f"link '{name}' is read as the frame of the lens, x right, y down, z forward"
+        entry = Entry(X, root if root in moving else "", "" if words.search(name) else text)
+        is_turned = "optical" not in name and words.search(name) is not None
+        found[name] = optical(name, entry, is_turned=is_turned)
     return found or "no camera or optical in the name of a link on a fixed joint"
 
 
@@ -435,14 +429,30 @@ def short_name(frame: str) -> str:
     return re.sub(ends, "", frame)
 
 
-def same_camera(pose: str, known: Sequence[str]) -> str | None:
-    """Return the known camera that a pose's name means; None: none, or several.
+def choose_frames(frames: Iterable[str], cameras: Sequence[str], path: Path) -> dict[str, str]:
+    """Return the frame of a file that means each camera, by the camera's name.
 
-    ``<serial>_left`` is DROID's left lens of ``<serial>``.
+    A frame means the camera of its name; or that of DROID's left lens, ``<serial>_left`` for
+    ``<serial>`` and the reverse; or the only one of the same ``short_name``. If all frames have one
+    short name, they mean the only camera. Of several frames of a camera, one by the first of these
+    rules is chosen, then one of colours, then an optical one.
+
+    Raises CameraError, naming ``path``: several frames of a camera are equally good.
     """
-    for name in (pose, f"{pose}_left", pose.removesuffix("_left")):
-        if name in known:
-            return name
-    short = plain_key(short_name(pose))
-    alike = [one for one in known if short and plain_key(short_name(one)) == short]
-    return alike[0] if len(alike) == 1 else None
+    found = dict[str, list[tuple[list[bool], str]]]()
+    short = {frame: plain_key(short_name(frame)) for frame in frames}
+    for frame, key in short.items():
+        exact = [x for x in (frame, f"{frame}_left", frame.removesuffix("_left")) if x in cameras]
+        alike = exact[:1] or [one for one in cameras if plain_key(short_name(one)) == key]
+        if not alike and len({*short.values()}) == 1:
+            alike = [*cameras]
+        if len(alike) == 1:
+            kinds = [frame in cameras, bool(exact), "color" in frame or "rgb" in frame]
+            found.setdefault(alike[0], []).append(([*kinds, "optical" in frame], frame))
+    for camera, ranked in found.items():
+        best = [frame for kinds, frame in ranked if kinds == max(ranked)[0]]
+        if len(best) > 1:
+            raise CameraError(
+                f"{path}: {listed(best)} are equally good names of camera '{camera}': keep one"
+            )
+    return {camera: max(ranked)[1] for camera, ranked in found.items()}

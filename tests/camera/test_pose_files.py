@@ -2,6 +2,7 @@
 
 import io
 import json
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -22,7 +23,7 @@ from drake_pose.camera.exchange import (
     ros_transforms,
 )
 from drake_pose.camera.models import PinholeCamera, inverse_pose
-from drake_pose.camera.pose_files import END_EFFECTOR
+from drake_pose.camera.pose_files import END_EFFECTOR, choose_frames
 from drake_pose.errors import CameraError
 
 X = np.eye(4)
@@ -279,9 +280,29 @@ def test_a_pose_of_no_camera_is_refused(tmp_path):
     intrinsics = tmp_path / "two.yaml"
     entry = {"width": 1280, "height": 720, "fx": 640, "fy": 642, "cx": 639.5, "cy": 359.5}
     intrinsics.write_text(yaml.safe_dump({"left": entry, "right": entry}))
-    with pytest.raises(CameraError, match="cameras are left, right: name them alike") as caught:
+    with pytest.raises(CameraError, match="cameras are left, right: name them alike"):
         load(tmp_path / "easy.yaml", easy(), intrinsics)
-    assert "--camera NAME" in str(caught.value)
+
+
+def test_each_camera_has_the_best_of_its_frames():
+    """Whatever the order in the file; equally good ones are refused."""
+    for frames, cameras, chosen in (
+        ("cam_link cam cam_color_optical_frame", "cam b", {"cam": "cam"}),
+        ("a_depth_optical_frame a_rgb_frame a_link", "cam", {"cam": "a_rgb_frame"}),
+        ("a_link a_infra1_optical_frame b", "A b", {"A": "a_infra1_optical_frame", "b": "b"}),
+        ("7 7_left 7_right", "7_left 7_right", {"7_left": "7_left", "7_right": "7_right"}),
+        ("7_left 7_link", "7", {"7": "7_left"}),
+        ("a_link b_link", "cam", {}),
+        ("a_link", "A a_base", {}),
+        ("a_left_optical_frame a_right_optical_frame", "a", None),
+        ("c_frame a_depth_link a_link", "a c", None),
+    ):
+        for given in (frames.split(), frames.split()[::-1]):
+            if chosen is None:
+                with pytest.raises(CameraError, match="equally good names of camera 'a'"):
+                    choose_frames(given, cameras.split(), Path())
+            else:
+                assert choose_frames(given, cameras.split(), Path()) == chosen
 
 
 def test_what_was_assumed_is_said(tmp_path, scene):

@@ -81,7 +81,7 @@ def read_measured_positions(path: Path, model: ParsedModel) -> JointLog:
     Raises SceneError: the table cannot be used; UnknownNameError: the model does not have the
     position of a column.
     """
-    log, _ = read_joint_table(path)
+    log, warnings = read_joint_table(path)
     if not log.frames:
         raise SceneError(f"{path}: the first line must be frame and the names of positions")
     is_estimate, names, numbers, frames = False, log.names, log.positions, log.frames
@@ -110,7 +110,7 @@ def read_measured_positions(path: Path, model: ParsedModel) -> JointLog:
     joint_of = {column.name: joint for joint, column in mapped.columns.items()}
     found = tuple(joint_of[column] for column in names)
     positions = mapped.positions[:, [mapped.names.index(name) for name in found]]
-    texts = tuple(f"{path}: {text}" for text in mapped.warnings)
+    texts = (*warnings, *(f"{path}: {text}" for text in mapped.warnings))
     return JointLog(
         found, None, positions, frames, columns=mapped.columns, warnings=texts,
         is_estimate=is_estimate, bases=bases,

@@ -72,6 +72,9 @@ def test_measured_positions_are_read_by_frame(tmp_path):
     assert truth.names == ("b", "a")
     assert truth.of_frames(["0003"]).tolist() == [[0.5, -1.0]]
     assert np.isnan(truth.of_frames(["0004", "still"])).all()
+    rows = "".join(f"\n{k},{k if k else 1.5},0" for k in range(20))
+    (late,) = read_measured_positions(written(path, f"frame,time,b{rows}"), ABC).warnings
+    assert "rows: number 1 (counted from 0) has the time 1.0" in late
     # Too long for a number: compared as a name.
     long = written(path, f"frame,b\n{'9' * 5000},0\n")
     assert read_measured_positions(long, ABC).by_frame.get(9) is None

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from drake_pose.arrays import Array, Picture
 from drake_pose.camera.calibration_files import lens_of
 from drake_pose.camera.episode import Episode, JointLog, Stream, ascending_indices
+from drake_pose.camera.models import pose_matrix
 from drake_pose.camera.picture_files import (
     decode_colours,
     import_reader,
@@ -155,9 +156,9 @@ def _scan(path: Path) -> tuple[Any, Any, Any, Any, Any, Any]:
             message = reader.deserialize(data, one.msgtype)
             if kind == "TFMessage":
                 for frame in message.transforms:
-                    X, shift, q = np.eye(4), frame.transform.translation, frame.transform.rotation
-                    X[:3, :3] = Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix()
-                    X[:3, 3] = shift.x, shift.y, shift.z
+                    shift, q = frame.transform.translation, frame.transform.rotation
+                    R = Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix()
+                    X = pose_matrix(R, [shift.x, shift.y, shift.z])
                     parent = frame.header.frame_id.strip("/")
                     parents[frame.child_frame_id.strip("/")] = parent, X
                 continue

@@ -208,19 +208,18 @@ def _placed(path: Path, entries: Mapping[str, Entry], known: CameraFile | None) 
     }
 
 
-def _read(path: Path, episode_ids: frozenset[str], largest: int = 1 << 29) -> Content:
+def _read(path: Path, episode_ids: frozenset[str]) -> Content:
     """Return the content of a file, read by the library for its kind.
 
     ``episode_ids``: of a `.jsonl`, only the lines that hold one of these names are read, if any do.
-    ``largest``: maximum size of the file [byte].
 
     Raises CameraError: the file cannot be read, or is damaged.
     """
     try:
-        data = read_regular(path, largest)
+        data = read_regular(path)
     except OSError as error:
         raise CameraError(f"{path}: cannot read it: {error.strerror}") from error
-    text, fault = data.decode("utf-8", errors="replace"), ""
+    text, fault = data.decode("utf-8-sig", errors="replace"), ""
     value: Any = None
     lines = (line.strip() for line in io.StringIO(text))
     first = next((line for line in lines if line and not line.startswith("#")), "")

@@ -21,7 +21,7 @@ from drake_pose.camera.bags import BAGS, open_bag
 from drake_pose.camera.camera_files import CameraFile, intrinsics_of, load_camera_file
 from drake_pose.camera.episode import Episode, JointLog, Stream, ascending_indices
 from drake_pose.camera.lerobot import INFO, open_lerobot
-from drake_pose.camera.models import Camera, Lens, PinholeCamera
+from drake_pose.camera.models import Camera, Lens, PinholeCamera, pose_matrix
 from drake_pose.camera.picture_files import (
     VIDEOS,
     Video,
@@ -515,10 +515,7 @@ def recorded_pose(rows: Any, name: str, warnings: list[str], moved: float = 0.00
             f"{np.degrees(spread[3:].max()):.1f} degrees; their median is used"
         )
     middle = np.median(values, axis=0)
-    X_WC = np.eye(4)
-    X_WC[:3, :3] = Rotation.from_euler("xyz", middle[3:]).as_matrix()
-    X_WC[:3, 3] = middle[:3]
-    return X_WC
+    return pose_matrix(Rotation.from_euler("xyz", middle[3:]).as_matrix(), middle[:3])
 
 
 def _picture_times(file: Any, path: Path, serial: str, count: int, warnings: list[str]) -> Array:

@@ -280,12 +280,15 @@ def camera_tuple(cameras: Mapping[str, Camera] | Iterable[Camera]) -> tuple[Came
     return found
 
 
+def pose_matrix(R: Array, p: Sequence[float] | Array) -> Array:
+    """Return the pose (4, 4) of a rotation (3, 3) and a position (3,) [m]."""
+    return np.vstack([np.column_stack([R, p]), [0.0, 0.0, 0.0, 1.0]])
+
+
 def inverse_pose(X_AB: np.ndarray) -> np.ndarray:
     """Return X_BA of a pose X_AB (4, 4)."""
-    X_BA = np.eye(4)
-    X_BA[:3, :3] = X_AB[:3, :3].T
-    X_BA[:3, 3] = -X_AB[:3, :3].T @ X_AB[:3, 3]
-    return X_BA
+    R_BA = X_AB[:3, :3].T
+    return pose_matrix(R_BA, -R_BA @ X_AB[:3, 3])
 
 
 FACE_CAMERA = "face"
@@ -355,10 +358,7 @@ def look_at(
         raise CameraError(f"a camera at {list(eye)} cannot look at {list(target)} with {up} up")
     forward /= np.linalg.norm(forward)
     right /= np.linalg.norm(right)
-    X_WC = np.eye(4)
-    X_WC[:3, :3] = np.column_stack([right, np.cross(forward, right), forward])
-    X_WC[:3, 3] = eye
-    return X_WC
+    return pose_matrix(np.column_stack([right, np.cross(forward, right), forward]), eye)
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,7 +15,15 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from drake_pose.arrays import Array
-from drake_pose.camera.models import Camera, Lens, PinholeCamera, check_pose, inverse_pose, numbers
+from drake_pose.camera.models import (
+    Camera,
+    Lens,
+    PinholeCamera,
+    check_pose,
+    inverse_pose,
+    numbers,
+    pose_matrix,
+)
 from drake_pose.errors import CameraError, listed
 
 END_EFFECTOR = "end effector"
@@ -97,9 +105,7 @@ ROUNDED = 0.01
 
 def _rigid(R: Array, p: Array, where: str, assumed: str) -> Entry:
     """Return the pose of a rotation (3, 3) and a translation (3,) [m]."""
-    X = np.eye(4)
-    X[:3, :3], X[:3, 3] = R, p
-    return Entry(check_pose(X, "the pose", where, most=ROUNDED), assumed=assumed)
+    return Entry(check_pose(pose_matrix(R, p), "the pose", where, most=ROUNDED), assumed=assumed)
 
 
 _HAND = "gripper|hand|flange|tool|tcp|eef?|endeffector|wrist"
@@ -209,7 +215,7 @@ def static_publishers(content: Content) -> Parsed:
         nodes = [one for one in launch.iter("node") if name in (one.get("type"), one.get("exec"))]
         texts = [node.get("args", "") for node in nodes]
     elif "LaunchDescription" in content.text or "Node(" in content.text:
-        blocks = content.text.split(name)[1:]
+        blocks = [one for one in content.text.split("Node(") if name in one]
         lists = [re.search(r"arguments\s*=\s*\[(.*?)\]", one, re.DOTALL) for one in blocks]
         texts = [one[1].replace(",", " ") for one in lists if one is not None]
     for text in texts:
@@ -307,9 +313,8 @@ def urdf(content: Content) -> Parsed:
                 "expand a xacro file first (xacro FILE > arm.urdf)"
             )
         if joint.get("type") == "fixed":
-            X_PC = np.eye(4)
-            X_PC[:3, :3], X_PC[:3, 3] = Rotation.from_euler("xyz", rpy).as_matrix(), xyz
-            frames[child] = parent, X_PC
+            turn = Rotation.from_euler("xyz", rpy).as_matrix()
+            frames[child] = parent, pose_matrix(turn, xyz)
         else:
             moving.add(child)
     words = re.compile("camera|optical|(^|_)cam(_|$)", re.IGNORECASE)
@@ -377,7 +382,10 @@ def _mujoco_pose(one: ElementTree.Element, where: str) -> Array:
 
 def _mujoco_camera(name: str, one: ElementTree.Element, X_WB: Array, link: str, path: str) -> Entry:
     """Return a camera of MuJoCo in a body whose pose in the world, or link, is X_WB (4, 4)."""
-    X = X_WB @ _mujoco_pose(one, f"{path}: camera '{name}'") @ np.diag([1.0, -1.0, -1.0, 1.0])
+    where = f"{path}: camera '{name}'"
+    if (mode := one.get("mode", "fixed")) != "fixed":
+        raise CameraError(f"{where}: its mode {mode} moves it; give its pose with mode fixed")
+    X = X_WB @ _mujoco_pose(one, where) @ np.diag([1.0, -1.0, -1.0, 1.0])
     size = [int(side) for side in _floats(one.get("resolution", ""))]
     focal, shift = _floats(one.get("focalpixel", "")), _floats(one.get("principalpixel", "0 0"))
     for fovy in [] if focal else _floats(one.get("fovy", "")):

@@ -5,15 +5,7 @@ from collections.abc import Sequence
 from itertools import product
 
 import numpy as np
-from pydrake.geometry import (
-    Mesh,
-    Meshcat,
-    MeshcatParams,
-    Rgba,
-    Role,
-    SceneGraph,
-    SourceId,
-)
+from pydrake.geometry import Mesh, Meshcat, MeshcatParams, Rgba, Role, SceneGraph, SourceId
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource

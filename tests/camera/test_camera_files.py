@@ -101,7 +101,9 @@ def test_bad_files_are_refused(tmp_path):
 def test_unreadable_and_unwritable_files_are_refused(tmp_path):
     (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe\x00\x80")
     (tmp_path / "large.yaml").write_text("# " + "x" * (1 << 21))
-    files = {"missing.yaml": "missing", ".": "folder"}
+    with (tmp_path / "huge.json").open("wb") as file:
+        file.truncate((1 << 31) + 1)
+    files = {"missing.yaml": "missing", ".": "folder", "huge.json": "larger"}
     files |= {"binary.yaml": "no camera file", "large.yaml": "larger"}
     for name, reason in files.items():
         with pytest.raises(CameraError, match=reason) as caught:

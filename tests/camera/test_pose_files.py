@@ -1,5 +1,6 @@
 """Files with poses of cameras alone, in the formats of the tools that write them."""
 
+import codecs
 import io
 import json
 from pathlib import Path
@@ -10,12 +11,7 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
-from drake_pose.camera.camera_files import (
-    CameraFile,
-    intrinsics_of,
-    load_camera_file,
-    load_cameras,
-)
+from drake_pose.camera.camera_files import CameraFile, intrinsics_of, load_camera_file, load_cameras
 from drake_pose.camera.exchange import (
     dump_scenario,
     mujoco_cameras,
@@ -49,9 +45,11 @@ SAME = {"translation": dict.fromkeys("xyz", 0.0), "rotation": dict.fromkeys("xyz
 LAUNCH = """<launch><!-- xyz="0 0 0" -->
   <node pkg="tf2_ros" type="static_transform_publisher" name="broadcaster" args="{}  {} {} {}" />
 </launch>"""
-LAUNCH_PY = f"""LaunchDescription([Node(package='tf2_ros', executable='static_transform_publisher',
-    arguments=[{", ".join(f"'{x!r}'" for x in SIX[:3])}, {str(QUATERNION)[1:-1]}, 'base', "cam"])])
-"""
+PUBLISHER = (
+    "executable='static_transform_publisher'",
+    f"arguments=[{', '.join(repr(str(x)) for x in SIX[:3])}, {str(QUATERNION)[1:-1]}, "
+    "'base', \"cam\"]",
+)
 ECHO = f"""[INFO] [17.2]: Waiting for transform base ->  cam: Invalid frame ID
 At time 17.5
 - Translation: {np.round(SIX[:3], 4).tolist()}
@@ -151,9 +149,13 @@ FILES = [
     ("pose.launch", launch(QUATERNION, "cam_optical")),
     ("pose.launch", launch(LINK_Q, "camera_link")),
     ("pose.launch", launch(SIX[:2:-1], "cam_optical", "100")),
-    ("pose.launch.py", LAUNCH_PY),
+    *(
+        ("pose.launch.py", f"LaunchDescription([Node(package='tf2_ros', {', '.join(words)})])")
+        for words in (PUBLISHER, PUBLISHER[::-1])
+    ),
     ("pose.launch.xml", ros_transforms([CAMERA], {"left": "base"})),
     ("tf.yaml", {"transforms": FRAMES}),
+    ("notepad.json", codecs.BOM_UTF8 + json.dumps({"left": SIX}).encode()),
     ("rounded.yaml", {"T_base_camera": X.round(3).tolist()}),
     ("rounded.txt", 2 * ECHO),
     ("one.npy", saved(np.save, X)),
@@ -244,6 +246,7 @@ def test_what_is_wanted_is_said(tmp_path):
         ({"left": {"t": SIX[:3], "R": (1.2 * X[:3, :3]).tolist()}}, ["not a rotation"]),
         ({"rvecs": [[0.1, 0.2, 0.3], [1.0, 1.1, 1.2]]}, ["it has rvecs. Tried"]),
         ({"left": {"speed": 3}}, ["it has left. Tried", "easy_handeye", "NAME: POSE"]),
+        (mjcf('name="a" mode="targetbody" target="b"'), ["camera 'a': its mode targetbody"]),
     ):
         with pytest.raises(CameraError) as caught:
             load(tmp_path / "cameras.json", content, None)

@@ -2,7 +2,7 @@ import cv2
 import numpy as np
 
 from drake_pose.files import overlay
-from drake_pose.files.overlay import PALETTE, draw_overlay, draw_shapes, paint_agreement
+from drake_pose.files.overlay import PALETTE, draw_shapes, paint_agreement
 
 
 def rectangle(shape, rows, columns):
@@ -58,15 +58,6 @@ def test_shapes_are_contours_over_the_silhouette():
         shown = count(picture, colour) - count(legend, colour)
         assert own < shown < 4 * own
     assert count(picture, overlay.AGREEMENT_RGB) > 0.95 * 400 * 400
-
-
-def test_a_small_overlay_is_enlarged_by_an_integer_without_text_on_it():
-    whole, none = np.ones((40, 40), dtype=bool), np.zeros((40, 40), dtype=bool)
-    drawn = [PALETTE[draw_overlay(whole, body, None, "t")] for body in (none, whole)]
-    shown = [count(picture, overlay.MISSING_RGB) for picture in drawn]
-    scale = int(np.sqrt((shown[0] - shown[1]) / 40**2))
-    assert scale > 1
-    assert shown[0] - shown[1] == (40 * scale) ** 2
 
 
 def test_png_of_rgb_and_of_palette_indices_are_equal():

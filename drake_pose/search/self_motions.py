@@ -75,9 +75,7 @@ def flips(kinematics: TreeKinematics, values: np.ndarray, count: int = 16) -> li
             break
         for flip in _single_flips(kinematics, one, triples):
             gaps = flip.values - np.array([other.values for other in known])
-            # Differences from -pi to pi.
-            gaps = np.abs((gaps + math.pi) % (2.0 * math.pi) - math.pi)
-            if gaps.max(axis=1).min() > 1e-6:
+            if np.abs(np.angle(np.exp(1j * gaps))).max(axis=1).min() > 1e-6:
                 known.append(flip)
     found = []
     for flip in known[1 : count + 1]:

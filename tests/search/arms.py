@@ -47,7 +47,7 @@ def arm_tree(folder: Path) -> PoseTree:
     """Return the arm's pose tree; ``folder``: where its URDF is written."""
     path = folder / "arm.urdf"
     path.write_text(arm_urdf())
-    return load_model(path).pose_tree()
+    return load_model(path, check=False).pose_tree()
 
 
 def arm_cameras(width: int = 320, height: int = 240) -> tuple[PinholeCamera, ...]:

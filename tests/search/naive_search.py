@@ -1,45 +1,40 @@
 """A naive implementation of sections 5.1 and 5.2 of Kameda's paper, as a reference for tests.
 
-It follows the paper's text with boolean images instead of spans and prefix sums, in one view.
+It follows the paper's text with boolean images (views, H, W) instead of spans and prefix sums.
 """
 
 import itertools
 
 import numpy as np
 
-from drake_pose.silhouette.outline import TreeSurfaces
-from drake_pose.silhouette.scoring import draw_mask
-
 
 class NaiveSearch:
-    def __init__(self, search, camera, silhouette, r, K):
-        self.tree = search.tree
-        self.values = search.sampled.values
-        self.surfaces = TreeSurfaces(search.tree)
-        self.camera, self.S, self.r, self.K = camera, silhouette, r, K
+    """``maker``: draws the body. ``masks``: the silhouettes of its first cameras."""
+
+    def __init__(self, maker, masks, r, K):
+        self.maker, self.tree, self.values = maker, maker.tree, maker.body.sampled.values
+        self.S, self.r, self.K = np.array(masks), r, K
         self.lists, self.u = {}, {}
         self.runs = 0
         self.first_J = None
         self.best = None
 
-    def picture(self, i, values):
-        """Return P_i, with the candidates adopted for the other nodes."""
+    def picture(self, i, t):
+        """Return P_i at sample t, with the candidates adopted for the other nodes."""
         full = [grid[0] for grid in self.values]
-        for k, t in self.u.items():
-            full[k] = self.values[k][self.lists[k][t]]
-        full[i] = values
-        X_CN = self.camera.X_CW @ self.tree.node_poses(full)
-        surface = self.surfaces.node_at(i, full[i])
-        return draw_mask([surface], X_CN[i : i + 1], self.camera)
-
-    def adopted_picture(self, i):
-        return self.picture(i, self.values[i][self.lists[i][self.u[i]]])
+        for k, adopted in self.u.items():
+            full[k] = self.values[k][self.lists[k][adopted]]
+        full[i] = self.values[i][t]
+        return self.maker.draw_node(i, full, len(self.S))
 
     def union(self, nodes):
         result = np.zeros_like(self.S)
         for i in nodes:
-            result |= self.adopted_picture(i)
+            result |= self.picture(i, self.lists[i][self.u[i]])
         return result
+
+    def J(self):
+        return int((self.union(self.u) ^ self.S).sum())
 
     def run(self):
         while self.section_5_1():
@@ -50,7 +45,7 @@ class NaiveSearch:
         return self
 
     def note(self):
-        J = int((self.union(self.u) ^ self.S).sum())
+        J = self.J()
         if self.first_J is None:
             self.first_J = J
         if self.best is None or J < self.best[0]:
@@ -67,10 +62,13 @@ class NaiveSearch:
             self.runs += 1
             open_part = self.S & ~self.union(self.u)
             scored = []
-            for t, values in enumerate(self.values[i]):
-                P = self.picture(i, values)
-                outside = (P & ~self.S).sum()
-                if outside <= self.r:
+            samples = range(len(self.values[i]))
+            if self.tree.source(i) != i:
+                # The joints mimic the parent's.
+                samples = [self.lists[nodes[i].parent][self.u[nodes[i].parent]]]
+            for t in samples:
+                P = self.picture(i, t)
+                if ((P & ~self.S).sum(axis=(1, 2)) <= self.r).all():
                     scored.append((-int((open_part & P).sum()), t))
             scored.sort()
             if scored:
@@ -87,22 +85,17 @@ class NaiveSearch:
 
     def change(self, j, t):
         self.u[j] = t
-        for k in range(len(self.tree.nodes)):
-            ancestor = self.tree.nodes[k].parent
-            while ancestor >= 0:
-                if ancestor == j:
-                    self.u.pop(k, None)
-                ancestor = self.tree.nodes[ancestor].parent
+        for below in self.tree.subtrees[j][1:]:
+            self.u.pop(below, None)
 
     def section_5_2_1(self):
-        leaves = [i for i, node in enumerate(self.tree.nodes) if not node.children]
+        leaves = self.tree.leaves
         before = dict(self.u)
-        best = int((self.union(self.u) ^ self.S).sum()), before
+        best = self.J(), before
         for combination in itertools.product(*(range(len(self.lists[i])) for i in leaves)):
             self.u = before | dict(zip(leaves, combination, strict=True))
-            J = int((self.union(self.u) ^ self.S).sum())
-            if best[0] > J:
-                best = J, dict(self.u)
+            if best[0] > self.J():
+                best = self.J(), dict(self.u)
         self.u = best[1]
         self.note()
 
@@ -117,7 +110,7 @@ class NaiveSearch:
             for i in A:
                 R = self.S & ~self.union([k for k in self.u if k != i])
                 for t in range(self.u[i], len(self.lists[i])):
-                    P = self.picture(i, self.values[i][self.lists[i][t]])
+                    P = self.picture(i, self.lists[i][t])
                     covers.append((-int((R & P).sum()), i, t))
             _, m, t_m = min(covers)
             if t_m > self.u[m]:

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from drake_pose.errors import SettingsError
 from drake_pose.search.branch_and_bound import branch_and_bound
 from drake_pose.search.partial_poses import BoundLimits
 from tests.search.bodies import box_link, joint, load_body
@@ -21,31 +22,37 @@ def test_finds_exactly_the_poses_within_the_limit(maker, views, extra):
         problem = maker.make(generator, views=views, noise=noise, on_grid=on_grid)
         limit = problem.best[1] + extra
         found = branch_and_bound(maker.body, problem.views, limit)
-        assert found.complete
-        expected = problem.within(limit)
-        assert members(found.graph, problem) == expected
-        assert found.graph.size == len(expected)
-        for row, J in zip(problem.choices, problem.Js, strict=True):
-            if J <= limit:
-                assert found.graph.objective(row) == J
-            else:
-                assert found.lower_bound <= J
+        expected, graph = problem.within(limit), found.graph
+        assert (found.complete, found.limited, found.J_limit) == (True, False, limit)
+        assert graph.size == len(expected)
+        assert graph.best_J == (problem.best[1] if expected else np.inf)
+        Js = [graph.objective(row) for row in problem.choices]
+        known = np.array([np.inf if J is None else J for J in Js])
+        np.testing.assert_array_equal(known, np.where(problem.Js <= limit, problem.Js, np.inf))
+        beyond = problem.Js[problem.Js > limit]
+        assert found.lower_bound <= beyond.min(initial=np.inf)
         if extra < 0.0:
             assert found.lower_bound == problem.best[1]
+        rows = np.array(sorted(expected)).reshape(-1, len(maker.tree.nodes))
+        for used, column in zip(graph.samples_used(), rows.T, strict=True):
+            np.testing.assert_array_equal(used, np.unique(column))
 
 
-def test_poses_left_out_are_not_below_the_lower_bound(maker):
-    generator = np.random.default_rng(3)
-    for limits in (BoundLimits(states=3), BoundLimits(pairs=5), BoundLimits(time_limit=0.0)):
-        problem = maker.make(generator, views=1, noise=0.02, on_grid=False)
-        J = problem.best[1]
-        found = branch_and_bound(maker.body, problem.views, J + 60.0, limits)
-        assert not found.complete
-        there = members(found.graph, problem)
-        assert there <= problem.within(J + 60.0)
-        left_out = [J for row, J in zip(problem.choices.tolist(), problem.Js, strict=True)
-                    if tuple(row) not in there]  # fmt: skip
-        assert min(left_out) >= found.lower_bound
+@pytest.mark.parametrize(
+    "limits", [{"states": 3}, {"pairs": 5}, {"time_limit": 0.0}, {"poses": 20}, {"memory": 20_000}]
+)
+def test_poses_left_out_are_not_below_the_lower_bound(maker, limits):
+    problem = maker.make(np.random.default_rng(3), views=1, noise=0.02)
+    J = problem.best[1]
+    found = branch_and_bound(maker.body, problem.views, J + 60.0, BoundLimits(**limits))
+    assert (found.complete, found.limited) == (False, True)
+    there = members(found.graph, problem)
+    assert there <= problem.within(J + 60.0)
+    left_out = [tuple(row) not in there for row in problem.choices.tolist()]
+    assert problem.Js[left_out].min() >= found.lower_bound
+    for name, value in limits.items():
+        with pytest.raises(SettingsError, match=name):
+            BoundLimits(**{name: value - value - 1})
 
 
 def test_all_poses_of_hidden_limbs_are_counted(tmp_path):
@@ -55,17 +62,16 @@ def test_all_poses_of_hidden_limbs_are_counted(tmp_path):
         joint("trunk_turn", "revolute", "world", "trunk", (0.0, 0.0)),
     ]
     for side, y in (("left", 5.0), ("right", -5.0)):
+        upper, lower = f"{side}_upper", f"{side}_lower"
         parts += [
-            box_link(f"{side}_upper", 3, 6, z=-3.0),
-            joint(f"{side}_shoulder", "revolute", "trunk", f"{side}_upper", (-1.5, 1.5), y=y),
-            box_link(f"{side}_lower", 3, 6, z=-3.0),
-            joint(
-                f"{side}_elbow", "revolute", f"{side}_upper", f"{side}_lower", (-1.5, 1.5), z=-5.0
-            ),
+            box_link(upper, 3, 6, z=-3.0),
+            joint(f"{side}_shoulder", "revolute", "trunk", upper, (-1.5, 1.5), y=y),
+            box_link(lower, 3, 6, z=-3.0),
+            joint(f"{side}_elbow", "revolute", upper, lower, (-1.5, 1.5), z=-5.0),
         ]
-    maker = ProblemMaker(load_body(tmp_path, *parts).pose_tree(), 0.5)
-    problem = maker.make(np.random.default_rng(5), views=1, noise=0.0, on_grid=True)
-    found = branch_and_bound(maker.body, problem.views, 0.0)
+    maker = ProblemMaker(load_body(tmp_path, *parts).pose_tree(), interval=0.5)
+    view = maker.draw([grid[0] for grid in maker.body.sampled.values], maker.cameras[0])
+    found = branch_and_bound(maker.body, maker.problem(view).views, 0.0)
     assert found.complete
     assert found.graph.size == len(maker.choices) == 7**4
     # All poses of a hidden limb's end lead to the same state.
@@ -73,7 +79,7 @@ def test_all_poses_of_hidden_limbs_are_counted(tmp_path):
 
 
 def test_restricting_limit_or_samples_removes_poses(maker):
-    problem = maker.make(np.random.default_rng(7), views=1, noise=0.0, on_grid=False)
+    problem = maker.make(np.random.default_rng(7), views=1)
     best = problem.best[1]
     graph = branch_and_bound(maker.body, problem.views, best + 100.0).graph
     assert tuple(graph.central().tolist()) in problem.within(best)

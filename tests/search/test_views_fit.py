@@ -1,5 +1,6 @@
 """Pose sets from damaged masks: intervals, undetermined joints, flips, self-motions."""
 
+import cv2
 import numpy as np
 import pytest
 from scipy.stats import t as student
@@ -14,12 +15,18 @@ from drake_pose.fit.covariance import (
 )
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.surfaces import simplify_surfaces
-from drake_pose.search import ViewsFit, views_fit
+from drake_pose.search import View, ViewsFit, views_fit
 from drake_pose.search.self_motions import Flip, flips
-from drake_pose.search.views_fit import FittedPose, RobustModes, RobustSettings, distinct
+from drake_pose.search.views_fit import (
+    FittedPose,
+    RobustModes,
+    RobustSettings,
+    distinct,
+    refine_best,
+)
 from drake_pose.silhouette.outline import TreeSurfaces
 from tests.body.models import joint, link, urdf, write
-from tests.search.arms import arm_cameras, damaged_views, draw_view, is_held, split
+from tests.search.arms import arm_cameras, damaged_views, draw_view, is_held
 
 TRUTH = np.array([0.6, 0.7, -0.7, 0.9, 0.3])
 FINE = tuple(AnnealingStage(scale, 0.0125, 8) for scale in (0.025, 0.0125))
@@ -102,50 +109,66 @@ def test_refinement_respects_limits_and_held_values(kinematics):
     assert np.abs(near.values - TRUTH).max() < np.radians(1.5)
 
 
+@pytest.mark.parametrize("stage", [FINE[-1], AnnealingStage(0.1, 0.04, 6)])
+def test_costs_are_one_for_each_pixel_of_contour_that_is_far_off(kinematics, stage):
+    """Of both contours; a shift by more than the scale costs about half, a small one its square."""
+    tree, cameras = kinematics.tree, arm_cameras(640, 480)
+    outlines = simplify_surfaces(TreeSurfaces(tree))
+    masks = [draw_view(tree, TRUTH, camera).mask for camera in cameras]
+    contours = [cv2.findContours(m.view(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)[0]
+                for m in masks]  # fmt: skip
+    length = sum(cv2.arcLength(one, True) for found in contours for one in found)
+    size = np.sqrt(np.mean([mask.sum() for mask in masks]))
+    scale, costs = stage.scale * size, []
+    for by in (0.0, 0.1 * scale, 0.2 * scale, 1.7 * scale, 200.0):
+        moved = [np.roll(mask, round(by), axis=1) for mask in masks]
+        views = [View(*pair) for pair in zip(cameras, moved, strict=True)]
+        fit = ViewsFit(kinematics, outlines, views)
+        costs.append(fit.cost(TRUTH, stage))
+        tiles = fit.tile_costs(TRUTH, stage)
+        assert tiles.sum() == pytest.approx(costs[-1])
+        assert (fit.evaluations, fit.camera_count) == (2, 2)
+    # Tiles along the contours, with sides of a fifth of the size.
+    assert 0.8 < np.count_nonzero(tiles) / (2.0 * length / (0.2 * size)) < 1.6
+    assert fit.size == pytest.approx(size)
+    assert fit.edge_length == pytest.approx(length, rel=0.1)
+    assert costs[4] == pytest.approx(2.0 * fit.edge_length, rel=0.05)
+    assert 0.35 < costs[3] / costs[4] < 0.55
+    assert costs[0] < 0.05 * costs[4]
+    if scale > 5.0:
+        assert 3.0 < (costs[2] - costs[0]) / (costs[1] - costs[0]) < 4.5
+        rough = tuple(outlines[::-1])
+        # Stages of a large spacing compare the rough surfaces.
+        other = ViewsFit(kinematics, outlines, views, rough)
+        assert other.cost(TRUTH, FINE[-1]) == fit.cost(TRUTH, FINE[-1])
+        assert other.cost(TRUTH, stage) != fit.cost(TRUTH, stage)
+
+
+def test_only_the_best_distinct_starts_are_refined_further(kinematics):
+    views = [draw_view(kinematics.tree, TRUTH, camera) for camera in arm_cameras()]
+    fit = ViewsFit(kinematics, simplify_surfaces(TreeSurfaces(kinematics.tree)), views)
+    near, far = TRUTH + 0.05, TRUTH - np.array([0.0, 1.2, 0.0, 1.2, 0.0])
+    passes = [(FINE[:1], 3), (FINE[1:], 2)]
+    best, other = refine_best(fit, [far, near, near + 0.01], passes, lambda: True)
+    np.testing.assert_allclose(best.values, TRUTH, atol=0.02)
+    assert np.abs(other.values - TRUTH).max() > 0.3
+    assert best.cost == pytest.approx(fit.cost(best.values, FINE[-1]), rel=0.3)
+    # Without time the first start alone is refined.
+    (late,) = refine_best(fit, [far, near], passes, lambda: False)
+    np.testing.assert_allclose(late.values, other.values, atol=0.1)
+
+
 def test_distinct_keeps_the_best_of_equal_poses():
-    poses = [FittedPose(np.array([x, 0.0]), cost) for x, cost in ((0, 3), (0.01, 1), (1, 2))]
-    assert [pose.cost for pose in distinct(poses, 5)] == [1, 2]
+    places = ((0.0, 3), (0.01, 1), (1.0, 2), (1.049, 4), (2.0 * np.pi, 5))
+    poses = [FittedPose(np.array([x, 0.0]), cost) for x, cost in places]
+    assert [pose.cost for pose in distinct(poses, 5)] == [1, 2, 5]
+    assert [pose.cost for pose in distinct(poses, 5, np.array([True, False]))] == [1, 2]
+    assert [pose.cost for pose in distinct(poses, 5, apart=0.03)] == [1, 2, 4, 5]
     assert [pose.cost for pose in distinct(poses, 1)] == [1]
 
 
-def poses(kinematics, values):
-    """Return X_WN (nodes, 4, 4) by the pose tree instead of the compiled kinematics."""
-    return kinematics.tree.node_poses(split(kinematics.tree, values))
-
-
-def test_flips_keep_the_pose_of_the_last_link(kinematics):
-    found = flips(kinematics, TRUTH)
-    before = poses(kinematics, TRUTH)
-    assert found
-    for flip in found:
-        after = poses(kinematics, flip.values)
-        np.testing.assert_allclose(after[-1], before[-1], atol=1e-9)
-        assert np.abs(flip.values - TRUTH).max() > 0.1
-        assert ((flip.values >= kinematics.lower) & (flip.values <= kinematics.upper)).all()
-        np.testing.assert_array_equal(flip.values[~flip.changed], TRUTH[~flip.changed])
-    # Turret and roll turn by half a turn, the shoulder changes its sign.
-    expected = TRUTH + np.pi * np.array([-1, 0, 1, 0, 0])
-    expected[1] *= -1
-    best = min(found, key=lambda flip: np.abs(flip.values - expected).max())
-    np.testing.assert_allclose(best.values, expected, atol=1e-9)
-    assert best.mirrored.tolist() == [False, True, False, False, False]
-    assert best.changed.tolist() == [True, True, True, False, False]
-
-
-def test_flipping_twice_returns_to_the_start(kinematics):
-    for flip in flips(kinematics, TRUTH):
-        back = [again.values for again in flips(kinematics, flip.values)]
-        assert min(np.abs(values - TRUTH).max() for values in back) < 1e-9
-
-
-def test_flips_outside_the_limits_are_left_out(kinematics):
-    # The turret's limits are +-150 degrees, so 10 cannot become 190 degrees.
-    values = np.radians([10.0, 40.0, -30.0, 50.0, 20.0])
-    assert flips(kinematics, values) == []
-
-
 class Valley:
-    """A fit whose costs are known: a valley about TRUTH along `along`, with defects of masks.
+    """A fit whose costs are known: a valley about a pose along ``along``, with defects of masks.
 
     The cost of a pose that is off by d along the valley is d^2 / width^2 in each of 100 tiles;
     defects of the masks move `scatter` from one tile to another.
@@ -153,23 +176,24 @@ class Valley:
 
     edge_length, camera_count = 1000.0, 2
 
-    def __init__(self, kinematics, along, deviation, width, scatter=0.2):
-        self.kinematics, self.along = kinematics, np.array(along, float)
+    def __init__(self, kinematics, along, deviation, width, scatter=0.2, truth=TRUTH):
+        self.kinematics, self.along, self.truth = kinematics, np.array(along, float), truth
+        self.index = int(np.argmax(np.abs(self.along)))
         self.deviation, self.width, self.scatter = deviation, width, scatter
         self.started = []
 
     def tile_costs(self, values, stage):
-        d = float((values - TRUTH)[0] / self.along[0])
+        d = float((values - self.truth)[self.index] / self.along[self.index])
         costs = np.full(100, 1.0 + (d / self.width) ** 2)
         costs[:50] += self.scatter * (d != 0.0)
         costs[50:] -= self.scatter * (d != 0.0)
         return costs
 
     def refine(self, values, stages, held=()):
-        self.started.append(values - TRUTH)
-        (k,) = held or (0,)
-        d = (values - TRUTH)[k] / self.along[k]
-        return FittedPose(TRUTH + d * self.along)
+        self.started.append(values - self.truth)
+        (k,) = held or (self.index,)
+        d = (values - self.truth)[k] / self.along[k]
+        return FittedPose(self.truth + d * self.along)
 
     def distances(self, values, stage):
         rng, count = np.random.default_rng(0), 40
@@ -262,29 +286,27 @@ def test_poses_as_good_are_modes_or_widen_one(kinematics, monkeypatch):
 
 def test_flipped_modes_have_flipped_intervals(kinematics, monkeypatch):
     """A mirrored value's ends change sides; one that ended at a limit may extend to the new one."""
-    valley = Valley(kinematics, [1.0, 0.0, 0.0, 0.0, 0.0], 0.004, 2.0, scatter=1.0)
-    other = TRUTH + np.array([0.5, 0.4, 0.0, 0.0, 0.0])
-    settled = other.copy()
-    settled[1:] = TRUTH[1:]
-    changed, mirrored = np.array([1, 1, 0, 1, 0], bool), np.array([0, 1, 0, 0, 0], bool)
-    monkeypatch.setattr(views_fit, "flips", lambda *_: [Flip(other, changed, mirrored)])
-    modes = RobustModes(valley, lambda: True)
-    lower, upper = kinematics.local_limits(TRUTH)
-    low = TRUTH - np.array([0.05, 0.1, 0.1, 0.0, 0.1])
-    high = TRUTH + np.array([0.02, 0.03, 0.0, 0.1, 0.1])
-    # The third ends at a limit without being changed, the fourth is.
-    high[2], low[3] = upper[2], lower[3]
-    modes._best_costs = valley.tile_costs(TRUTH, None)
-    found = [FittedPose(TRUTH, low=low, high=high)]
-    modes._add_flipped(found, found[0])
-    assert len(found) == 2
-    np.testing.assert_allclose(found[1].values, settled)
-    np.testing.assert_allclose(
-        found[1].low, [settled[0] - 0.05, TRUTH[1] - 0.03, TRUTH[2] - 0.1, lower[3], TRUTH[4] - 0.1]
-    )
-    np.testing.assert_allclose(
-        found[1].high, [settled[0] + 0.02, TRUTH[1] + 0.1, upper[2], TRUTH[3] + 0.1, TRUTH[4] + 0.1]
-    )
-    # The same flip again is within the new mode.
-    modes._add_flipped(found, found[0])
-    assert [one.size for one in found] == [1, 2]
+    along = np.eye(5)[1]
+    narrow = Valley(kinematics, along, 0.004, 2.0, scatter=1.0)
+    width = student.ppf(0.975, 12) * np.sqrt(covariance_of(narrow)[1, 1])
+    truth = TRUTH.copy()
+    lower, upper = kinematics.lower[1], kinematics.upper[1]
+    for truth[1], at_limit in ((0.0, False), (upper - 0.5 * width, True)):
+        valley = Valley(kinematics, along, 0.004, 2.0, scatter=1.0, truth=truth)
+        other = truth - 0.5 * along
+        for changed, mirrored in ((False, False), (True, False), (True, True)):
+            flip = Flip(other, changed * along.astype(bool), mirrored * along.astype(bool))
+            monkeypatch.setattr(views_fit, "flips", lambda *_, flip=flip: [flip, flip])
+            find = RobustModes(valley, lambda: True).find
+            first, second = find([FittedPose(truth)], lambda values: float(values[1])).modes
+            # The same flip again is within the new mode.
+            assert (first.J, second.J, second.size) == (truth[1], other[1], 2)
+            for k in (0, 2, 3, 4):
+                assert second.joints[k].holds(truth[k])
+            below, above = width, (0.5 if at_limit else 1.0) * width
+            if at_limit and changed:
+                above = np.inf
+            if mirrored:
+                below, above = above, below
+            ends = max(lower, other[1] - below), min(upper, other[1] + above)
+            assert (second.joints[1].low, second.joints[1].high) == pytest.approx(ends)

@@ -342,10 +342,8 @@ def dump_cameras(
     ``cameras``: the cameras, by name or in sequence. ``links``: link of each camera that is mounted
     on one, by the camera's name, whose X_WC is written as X_LC; None: no camera is.
     """
-    content = {camera.name: describe_camera(camera) for camera in camera_tuple(cameras)}
-    for name, link in (links or {}).items():
-        if name in content:
-            content[name] |= {"link": link, "X_LC": content[name].pop("X_WC")}
+    links = links or {}
+    content = {one.name: describe_camera(one, links.get(one.name)) for one in camera_tuple(cameras)}
     return yaml.safe_dump(content, sort_keys=False)
 
 
@@ -424,12 +422,16 @@ def _read_camera(name: str, entry: Any, path: Path) -> Entry:
     return Entry(X, link, camera=seen, lens=lens)
 
 
-def describe_camera(camera: Camera) -> dict[str, Any]:
-    """Return a camera's entry in a camera file, from field names to numbers, lists and texts."""
+def describe_camera(camera: Camera, link: str | None = None) -> dict[str, Any]:
+    """Return a camera's entry in a camera file, from field names to numbers, lists and texts.
+
+    ``link``: the link that carries the camera, in whose frame its pose is; None: the world.
+    """
     entry = {"projection": "parallel"} if isinstance(camera, ParallelCamera) else {}
     names = [one.name for one in fields(camera) if one.name not in ("name", "X_WC")]
     entry |= {"clipping_near" if one == "near" else one: getattr(camera, one) for one in names}
-    return entry | {"X_WC": camera.X_WC.tolist()}
+    X = camera.X_WC.tolist()
+    return entry | ({"X_WC": X} if link is None else {"link": link, "X_LC": X})
 
 
 PARSERS: Mapping[str, Parser] = {

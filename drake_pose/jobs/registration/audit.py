@@ -16,7 +16,6 @@ import numpy as np
 
 from drake_pose.arrays import Array, Picture
 from drake_pose.body.tree_kinematics import TreeKinematics
-from drake_pose.camera.camera_files import describe_camera
 from drake_pose.camera.models import Camera
 from drake_pose.errors import DrakePoseError, RegistrationError, listed, noted_warnings
 from drake_pose.files.folder import read_summary, write_summary, writes_folder
@@ -33,7 +32,6 @@ from drake_pose.jobs.registration.large_errors import SceneComparison, SceneFit
 from drake_pose.jobs.registration.pages import audit_answer, audit_page
 from drake_pose.jobs.registration.positions import still_joints
 from drake_pose.jobs.registration.result import (
-    describe_pose,
     describe_run,
     write_comparisons,
     write_corrections,
@@ -41,8 +39,7 @@ from drake_pose.jobs.registration.result import (
 )
 from drake_pose.jobs.registration.tracks import (
     compare_on_link,
-    describe_on_link,
-    describe_pictures,
+    describe_found,
     draw_tracks,
     given_on_link,
     register_on_link,
@@ -160,15 +157,14 @@ def audit_scene(
         for name in forgotten
     ]
     units = zip(inputs.model.position_names, user_units(inputs.model), strict=True)
-    least = found.minimum_detectable
-    center = found.center
+    least, center = found.minimum_detectable, found.center
+    results: dict[str, PictureRegistration | TrackRegistration] = {**pictures.found, **tracks}
     summary = {
         "findings": _describe_findings(found),
         "frame_count": len(found.frames),
         "agreeing_count": len(found.frames) - len(found.outliers),
         "frames": {one.frame: _describe_frame(inputs, one) for one in found.frames},
-        "found_cameras": {name: _describe_found(one) for name, one in pictures.found.items()}
-        | {name: describe_on_link(one, given.links[name]) for name, one in tracks.items()},
+        "found_cameras": {k: describe_found(v, given.links.get(k)) for k, v in results.items()},
         "minimum_detectable": {
             name: unit * least[name] if math.isfinite(least[name]) else None
             for name, unit in units
@@ -196,17 +192,6 @@ def _describe_frame(inputs: RegistrationInputs, one: FrameDiagnosis) -> dict[str
         "fits_when_freed": dict(one.fitted_ratios),
         "pixels": one.pixels,
         "masks": mask_digests(inputs.scene, names, one.frame),
-    }
-
-
-def _describe_found(result: PictureRegistration) -> dict[str, Any]:
-    """Return the part of summary.json on a camera that stands still, as found in its pictures."""
-    found = result.found
-    return {
-        **describe_pictures(result),
-        **describe_pose("X_WC", found.camera.X_WC, found),
-        "camera": describe_camera(found.camera),
-        "covariance": found.covariance.tolist(),
     }
 
 

@@ -9,12 +9,11 @@ from typing import Any
 
 import cv2
 import numpy as np
-import yaml
 from scipy.special import chdtrc
 
 from drake_pose.arrays import Array
 from drake_pose.body.tree_kinematics import TreeKinematics
-from drake_pose.camera.camera_files import dump_cameras
+from drake_pose.camera.camera_files import describe_camera
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import CameraError, RegistrationError, listed, weighted
 from drake_pose.files.folder import OVERLAY, write_file
@@ -331,17 +330,19 @@ def register_on_link(
     )
 
 
-def describe_on_link(result: TrackRegistration, link: str) -> dict[str, Any]:
-    """Return the part of an audit's summary.json on a camera that rides on a link."""
-    found = result.found
+def describe_found(
+    result: PictureRegistration | TrackRegistration, link: str | None = None
+) -> dict[str, Any]:
+    """Return the part of an audit's summary.json on a camera; link: that carries it, if any."""
+    found, name = result.found, "X_WC" if link is None else "X_LC"
+    if isinstance(result, TrackRegistration):
+        how = {"link": link, **describe_lens_and_clock(result), "explained": result.explained}
+    else:
+        how = describe_pictures(result)
     return {
-        "link": link,
-        **describe_lens_and_clock(result),
-        **describe_pose("X_LC", found.camera.X_WC, found),
-        "explained": result.explained,
-        "camera": yaml.safe_load(dump_cameras([found.camera], {found.camera.name: link}))[
-            found.camera.name
-        ],
+        **how,
+        **describe_pose(name, found.camera.X_WC, found),
+        "camera": describe_camera(found.camera, link),
         "covariance": found.covariance.tolist(),
     }
 

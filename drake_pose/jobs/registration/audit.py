@@ -23,11 +23,7 @@ from drake_pose.files.records import mask_digests, user_units
 from drake_pose.files.settings import AuditSettings, percent
 from drake_pose.jobs.estimate.measurements import left_out_warnings
 from drake_pose.jobs.registration.diagnosis import compare_camera, compare_clock
-from drake_pose.jobs.registration.inputs import (
-    RegistrationInputs,
-    on_link,
-    read_inputs,
-)
+from drake_pose.jobs.registration.inputs import RegistrationInputs, on_link, read_inputs
 from drake_pose.jobs.registration.large_errors import SceneComparison, SceneFit
 from drake_pose.jobs.registration.pages import audit_answer, audit_page
 from drake_pose.jobs.registration.positions import still_joints
@@ -56,10 +52,7 @@ from drake_pose.jobs.registration.words import (
 )
 from drake_pose.registration.diagnosis import DIAGNOSIS
 from drake_pose.registration.findings import Diagnosis, Finding, FrameDiagnosis
-from drake_pose.registration.picture_acceptance import (
-    PictureRegistration,
-    evaluate_pictures,
-)
+from drake_pose.registration.picture_acceptance import PictureRegistration, evaluate_pictures
 from drake_pose.registration.posed_frames import MultiViewFrame, PosedFrame
 from drake_pose.registration.register import RegistrationBody
 from drake_pose.registration.track_registration import TrackRegistration

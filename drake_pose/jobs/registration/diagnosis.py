@@ -326,8 +326,6 @@ def compare_camera(
         values: (f, m) the pose tree's values in the compared frames [rad or m].
         alone: whether it is the only camera, so that the base may have moved instead.
     """
-    difference = pose_difference(found.camera.X_WC, given.X_WC)
-    p_value = float(chdtrc(len(difference), squared_distance(difference, found.covariance)))
     middle = placed_points(body.coarse, body.kinematics.poses(values[0])).mean(axis=0)
     distance = float(np.linalg.norm(found.camera.X_WC[:3, 3] - middle))
     text, reading = "", likeliest_reading(given.X_WC, found.camera.X_WC, distance)
@@ -337,12 +335,21 @@ def compare_camera(
             f"; its X_WC seems to be {words}: read so, it is off by {np.degrees(angle):.2f} "
             f"degrees and {1e3 * shift:.1f} mm"
         )
-    return Finding(
-        "camera", given.name, float(np.linalg.norm(difference[:3])),
-        float(np.linalg.norm(difference[3:])), found.rotation_sd, found.translation_sd,
-        _picture_shift(body, (given, values), (found.camera, values)), p_value,
-        ("base",) if alone and not text else (), text=text,
-    )  # fmt: skip
+    pixels = _picture_shift(body, (given, values), (found.camera, values))
+    others = ("base",) if alone and not text else ()
+    return replace(pose_finding(given, found, pixels), alternatives=others, text=text)
+
+
+def pose_finding(given: PinholeCamera, found: RegisteredCamera, pixels: float) -> Finding:
+    """Return the difference of a camera's given pose from the registered one as a finding.
+
+    pixels: by how much it moves what the camera sees.
+    """
+    difference = pose_difference(found.camera.X_WC, given.X_WC)
+    turn, shift = (float(np.linalg.norm(part)) for part in np.split(difference, 2))
+    p_value = float(chdtrc(len(difference), squared_distance(difference, found.covariance)))
+    sds = found.rotation_sd, found.translation_sd
+    return Finding("camera", given.name, turn, shift, *sds, pixels, p_value)
 
 
 def compare_clock(

@@ -24,10 +24,7 @@ from drake_pose.jobs.registration.diagnosis import (
     require_determined,
     require_explained,
 )
-from drake_pose.jobs.registration.inputs import (
-    RegistrationInputs,
-    read_inputs,
-)
+from drake_pose.jobs.registration.inputs import RegistrationInputs, read_inputs
 from drake_pose.jobs.registration.lerobot_files import lerobot_files, require_data_set
 from drake_pose.jobs.registration.pages import compared_frames
 from drake_pose.jobs.registration.positions import (

@@ -30,10 +30,7 @@ from drake_pose.jobs.registration.pages import compared_frames, registration_pag
 from drake_pose.registration.findings import Diagnosis, Finding
 from drake_pose.registration.joint_offsets import KinematicParameter
 from drake_pose.registration.posed_frames import PosedFrame
-from drake_pose.registration.register import (
-    RegisteredCamera,
-    TargetPose,
-)
+from drake_pose.registration.register import RegisteredCamera, TargetPose
 from drake_pose.silhouette.pictures.masks import encode_mask
 from drake_pose.silhouette.pictures.scenes import CAMERA_FILE
 

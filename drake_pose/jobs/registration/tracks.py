@@ -9,7 +9,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from scipy.special import chdtrc
 
 from drake_pose.arrays import Array
 from drake_pose.body.tree_kinematics import TreeKinematics
@@ -19,22 +18,15 @@ from drake_pose.errors import CameraError, RegistrationError, listed, weighted
 from drake_pose.files.folder import OVERLAY, write_file
 from drake_pose.files.overlay import EXCESS_RGB, encode_png
 from drake_pose.files.settings import RegistrationSettings
+from drake_pose.jobs.registration.diagnosis import pose_finding
 from drake_pose.jobs.registration.inputs import RegistrationInputs, on_link
 from drake_pose.jobs.registration.result import AS_GIVEN, describe_parameters, describe_pose
-from drake_pose.jobs.registration.words import (
-    describe_drift,
-    describe_error,
-    lost_frames_warning,
-)
+from drake_pose.jobs.registration.words import describe_drift, describe_error, lost_frames_warning
 from drake_pose.registration.camera_motion import PictureMotion, find_camera_motion
 from drake_pose.registration.diagnosis import DIAGNOSIS
 from drake_pose.registration.findings import Finding
-from drake_pose.registration.online_registration import pose_difference, squared_distance
 from drake_pose.registration.picture_acceptance import PictureRegistration, PictureStart
-from drake_pose.registration.picture_registration import (
-    fit_pictures,
-    register_pictures,
-)
+from drake_pose.registration.picture_registration import fit_pictures, register_pictures
 from drake_pose.registration.picture_search import rotation_between
 from drake_pose.registration.posed_frames import PosedFrame
 from drake_pose.registration.recording import Recording, choose_pictures, posed_pictures
@@ -396,14 +388,9 @@ def given_on_link(
 
 def compare_on_link(result: TrackRegistration, given: PinholeCamera) -> Finding:
     """Return the difference of a given pose on a link from the registered one as a finding."""
-    found, shifts = result.found, result.points_in(given) - result.points_in(result.found.camera)
-    difference = pose_difference(found.camera.X_WC, given.X_WC)
-    return Finding(
-        "camera", given.name, float(np.linalg.norm(difference[:3])),
-        float(np.linalg.norm(difference[3:])), found.rotation_sd, found.translation_sd,
-        float(np.sqrt(np.nanmedian((shifts**2).sum(axis=1)))),
-        float(chdtrc(len(difference), squared_distance(difference, found.covariance))),
-    )  # fmt: skip
+    shifts = result.points_in(given) - result.points_in(result.found.camera)
+    pixels = float(np.sqrt(np.nanmedian((shifts**2).sum(axis=1))))
+    return pose_finding(given, result.found, pixels)
 
 
 def describe_given(result: TrackRegistration, given: PinholeCamera) -> str:

@@ -122,26 +122,23 @@ def audit_scene(
         pictures, tracks = _Pictures(), dict[str, TrackRegistration]()
         frames, findings, given = list[FrameDiagnosis](), list[Finding](), inputs
         standing = [one.name for one in inputs.searched_cameras if one.name not in inputs.links]
-        compared: SceneFit | None = None
+        compared, refused = None, {**inputs.riding}
         if inputs.links or inputs.riding:
-            tracks, frames, findings = _find_on_links(inputs, settings)
+            tracks, frames, findings = _find_on_links(inputs, settings, refused)
             given = inputs.of_cameras([name for name in standing if name not in inputs.riding])
         if not inputs.recordings:
             compared = SceneComparison(inputs, on_frame).run()
         elif given.searched_cameras and (given.given_cameras or not given.given_on_links):
-            try:
-                inputs, pictures, compared = _compare_standing(given, near, on_frame)
-            except RegistrationError as error:
-                findings += _refusals({one.name: error for one in given.searched_cameras})
-                if not tracks:
-                    raise
+            inputs, pictures, compared = _compare_standing(given, near, on_frame, refused)
     if not pictures.found and not tracks and inputs.recordings:
-        raise next(iter(inputs.riding.values()), RegistrationError(findings[0].text))
+        raise next(iter(refused.values()))
     found, empty = (compared.found, compared.empty_frames) if compared else (Diagnosis((), ()), ())
-    common = (*pictures.findings, *findings, *found.common)
-    found = replace(found, common=common, frames=(*found.frames, *frames))
-    audited = {*pictures.found, *(one.name for one in common if one.kind == "refused")}
-    forgotten = [name for name in standing if inputs.recordings and name not in audited]
+    common = [Finding("refused", name, text=say_refused(why)) for name, why in refused.items()]
+    common += [*pictures.findings, *findings, *found.common]
+    found = replace(found, common=tuple(common), frames=(*found.frames, *frames))
+    forgotten = [
+        name for name in standing if inputs.recordings and name not in {*pictures.found, *refused}
+    ]
     seconds = time.perf_counter() - begin
     warnings = [*inputs.warnings, *(compared.warnings if compared else ())]
     warnings += _audit_warnings(inputs, found, empty)
@@ -204,16 +201,17 @@ class _Pictures:
 
 
 def _find_on_links(
-    inputs: RegistrationInputs, settings: AuditSettings
+    inputs: RegistrationInputs, settings: AuditSettings, refused: dict[str, RegistrationError]
 ) -> tuple[dict[str, TrackRegistration], list[FrameDiagnosis], list[Finding]]:
     """Register each camera of an episode that rides on a link, and compare it with its given pose.
 
+    refused: output: by camera, the error if no pose explains its pictures.
+
     Returns the registrations by camera; for each of their pictures the fraction of its points that
-    fits, as a diagnosis; and the findings: poses that differ from the given ones, and cameras that
-    were refused.
+    fits, as a diagnosis; and the findings: poses that differ from the given ones.
     """
     tracks, frames = dict[str, TrackRegistration](), list[FrameDiagnosis]()
-    refused, findings = {**inputs.riding}, list[Finding]()
+    findings = list[Finding]()
     for name, link in inputs.links.items():
         own, asked = on_link(inputs, name, settings)
         try:
@@ -225,38 +223,42 @@ def _find_on_links(
         difference = None if given is None else compare_on_link(result, given)
         if difference is not None and difference.p_value <= DIAGNOSIS.significance:
             findings.append(difference)
+        if name in {one.name for one in inputs.given_cameras}:
+            text = f"camera '{name}' has an X_WC, but moves with link '{link}': give link and X_LC"
+            findings.append(Finding("reading", text))
         for one in result.found.frames:
             ratios = {name: one.inlier_ratio}
             frames.append(FrameDiagnosis(f"{name}-{one.frame}", ratios, ratios, 0.0, None))
-    return tracks, frames, [*findings, *_refusals(refused)]
+    return tracks, frames, findings
 
 
 def _compare_standing(
-    given: RegistrationInputs, near: Path | None, on_frame: OnFrame | None
-) -> tuple[RegistrationInputs, _Pictures, SceneFit]:
+    given: RegistrationInputs,
+    near: Path | None,
+    on_frame: OnFrame | None,
+    refused: dict[str, RegistrationError],
+) -> tuple[RegistrationInputs, _Pictures, SceneFit | None]:
     """Find an episode's cameras that stand still, and compare its frames with them.
 
-    Returns the inputs of the found cameras, their registrations, and what was compared.
+    refused: output: by camera, the error if no pose explains its pictures.
 
-    Raises RegistrationError: no camera is found.
+    Returns the inputs of the found cameras, their registrations, and what was compared; None: no
+    camera is found.
     """
-    inputs, pictures = _find_cameras(given, others=near)
-    compared = SceneComparison(inputs, on_frame).run()
-    offset_joints = [k.name for k in compared.found.common if k.kind == "joint"]
+    inputs, pictures = _find_cameras(given, refused, others=near)
+    compared = SceneComparison(inputs, on_frame).run() if pictures.found else None
+    common = compared.found.common if compared else ()
+    offset_joints = [k.name for k in common if k.kind == "joint"]
     if offset_joints:
         # Masks were segmented with wrong offsets, so they are made again.
-        inputs, pictures = _find_cameras(given, pictures, offset_joints)
-        compared = SceneComparison(inputs).run()
+        inputs, pictures = _find_cameras(given, refused, pictures, offset_joints)
+        compared = SceneComparison(inputs).run() if pictures.found else None
     return inputs, pictures, compared
-
-
-def _refusals(refused: Mapping[str, RegistrationError]) -> list[Finding]:
-    """Return a finding for each refused camera, by name."""
-    return [Finding("refused", name, text=say_refused(why)) for name, why in refused.items()]
 
 
 def _find_cameras(
     inputs: RegistrationInputs,
+    refused: dict[str, RegistrationError],
     before: _Pictures | None = None,
     offset_joints: Sequence[str] = (),
     near: float = 0.08,
@@ -266,6 +268,7 @@ def _find_cameras(
 
     Args:
         inputs: the episode, with given cameras.
+        refused: output: by camera, the error if no pose explains its pictures.
         before: an earlier result, from which fits start; None: poses are searched.
         offset_joints: names of the joints whose offsets are fitted.
         near: frames are compared with the given camera if the body's points in its pictures are
@@ -276,8 +279,6 @@ def _find_cameras(
         the inputs as a scene of masks, and the registrations. In the inputs each picture is a frame
         of its camera only, `known_cameras` have the poses that frames are compared with, and
         `given_cameras` are the cameras whose given pose is a finding.
-
-    Raises RegistrationError: no pose of any camera explains its pictures.
     """
     # Without any given pose, cameras are compared at the poses found.
     given_cameras = inputs.given_cameras or inputs.searched_cameras
@@ -291,11 +292,8 @@ def _find_cameras(
             "are compared with the pose found"
         )
     compared, findings = list[Camera](), list[Finding]()
-    if before is not None:
-        findings += [one for one in before.findings if one.kind == "refused"]
     names, frames = dict[str, tuple[str, str]](), list[MultiViewFrame]()
     placed = {camera.name for camera in given_cameras} if before is None else before.found
-    refused = dict[str, RegistrationError]()
     searched = [camera for camera in inputs.searched_cameras if camera.name in placed]
     pictures = {
         one.found.camera.name: one
@@ -309,7 +307,6 @@ def _find_cameras(
             near=None if others is None else _found_poses(others),
         )
     }
-    findings += _refusals(refused)
     for camera in inputs.searched_cameras:
         motion = inputs.motions[camera.name]
         for pixels, what in ((motion.drift, "drifts"), (motion.shake, "shakes")):
@@ -427,7 +424,8 @@ def _write_result(
                 title = f"{name}  frame {view.name}  OUTLIER  {fits} fits"
                 titled.append((PosedFrame(view.name, view.values, view.masks[name]), title))
         write_overlays(path, inputs.tree, camera, titled, inputs.visible_nodes, shown)
-    for given in inputs.given_cameras if overlay else ():
+    wrong = [one for one in inputs.given_cameras if one.name in pictures.found]
+    for given in wrong if overlay else ():
         registration = pictures.found[given.name]
         write_comparisons(
             path, inputs, registration.frames, given, registration.found, registration.pictures

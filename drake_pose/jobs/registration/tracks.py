@@ -166,10 +166,7 @@ def register_recordings(
         before: earlier registrations by camera, from which fits start; None: poses are searched.
         near: by camera, X_WC (4, 4) as found in another episode. A fit starts at the pose; if it
             fails, the pose is searched. None: all poses are searched.
-
-    Raises RegistrationError: every camera is refused.
     """
-    accepted = False
     for camera in cameras:
         name, recording = camera.name, inputs.recordings[camera.name]
         prior, guessed = SHARED.focal_deviation if name in focal else 0.0, False
@@ -188,11 +185,8 @@ def register_recordings(
                 )
         except RegistrationError as error:
             refused[name] = error
-            continue
-        accepted = True
-        yield result
-    if not accepted:
-        raise next(iter(refused.values()))
+        else:
+            yield result
 
 
 def say_refused(why: RegistrationError) -> str:

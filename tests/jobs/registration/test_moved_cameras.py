@@ -18,7 +18,7 @@ from drake_pose.jobs.registration import tracks
 from drake_pose.jobs.registration.audit import audit_scene
 from drake_pose.jobs.registration.inputs import read_inputs
 from drake_pose.jobs.registration.register import register_scene
-from drake_pose.jobs.registration.tracks import require_unmoved, watch_cameras
+from drake_pose.jobs.registration.tracks import register_recordings, require_unmoved, watch_cameras
 from drake_pose.registration.camera_motion import Nudge, PictureMotion
 from drake_pose.registration.recording import Recording
 from tests.benchmarks.registration import pose_error
@@ -89,6 +89,18 @@ def test_every_nudge_is_told_with_its_size_and_every_part_with_its_frames() -> N
     )
     with pytest.raises(RegistrationError, match=said):
         require_unmoved(camera, recording, PictureMotion(nudges))
+
+
+def test_each_camera_is_refused_for_its_own_reason(nudged) -> None:
+    scene, painted, _ = nudged
+    inputs = read_inputs(scene, painted.path, None, None, RegistrationSettings())
+    moved = {f"eye{k}": PictureMotion((Nudge(k, k + 1, 3.0, np.eye(3)[0]),)) for k in (2, 5)}
+    one = replace(inputs, recordings=dict.fromkeys(moved, inputs.recordings["camera"]))
+    cameras, refused = [replace(painted.camera, name=name) for name in moved], {}
+    found = register_recordings(painted.body, replace(one, motions=moved), cameras, refused)
+    assert not list(found)
+    for k in (2, 5):
+        assert f"between pictures 000{k} and 000{k + 1}" in str(refused[f"eye{k}"])
 
 
 def test_drift_and_shake_are_warned_of_with_their_turns(nudged) -> None:

@@ -114,6 +114,10 @@ def test_a_wrist_camera_is_found_over_things_on_a_table(tmp_path):
         audit = audit_scene(scene, arm, out=tmp_path / f"audit{off}", cameras=given).audit
         assert [one.name for one in audit.common] == names
         assert sum(one.shift for one in audit.common) == pytest.approx(off)
+    wrist = {key: one for key, one in file["wrist"].items() if key not in ("link", "X_LC")}
+    given.write_text(yaml.safe_dump({"wrist": wrist | {"X_WC": X_LC.tolist()}}))
+    audit = audit_scene(scene, arm, out=tmp_path / "standing", cameras=given)
+    assert "has an X_WC, but moves with link 'link5'" in audit.answer
 
 
 @pytest.mark.parametrize(

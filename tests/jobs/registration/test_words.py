@@ -12,7 +12,7 @@ import pytest
 from scipy.stats import chi2
 
 from drake_pose.errors import RegistrationError
-from drake_pose.files.overlay import EXCESS_RGB, body_drawer
+from drake_pose.files.overlay import EXCESS_RGB
 from drake_pose.fit.judge import PairedEvidence
 from drake_pose.jobs.registration.diagnosis import (
     compare_camera,
@@ -33,9 +33,7 @@ from drake_pose.registration.picture_matches import Sightings
 from drake_pose.registration.posed_frames import PosedFrame
 from drake_pose.registration.recording import Recording, TimeOffset
 from drake_pose.registration.register import FrameMisfit, RegisteredCamera, RegistrationBody
-from drake_pose.silhouette.outline import outline_from_mesh
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
-from drake_pose.silhouette.scoring import draw_mask
 from tests.jobs.registration.arm_scenes import write_arm_scene
 from tests.registration.arm_pictures import looking_at, shifted
 from tests.search.arms import arm_cameras, arm_tree
@@ -279,17 +277,3 @@ def test_several_poses_name_the_joint_that_tells_them_apart_best(body: Registrat
     assert size > 0.3
     assert "add frames" in mode_warnings(body, found, [])[0]
     assert mode_warnings(body, replace(found, alternatives=np.zeros((0, 4, 4))), [frame]) == []
-
-
-def test_bodies_are_drawn_with_the_index_of_the_shown_node(body: RegistrationBody) -> None:
-    camera, values = arm_cameras()[0], np.array([0.1, 0.4, 0.3, 0.5, 0.2])
-    names = [node.name for node in body.tree.nodes]
-    every = body_drawer(body.tree, None)(camera, values)
-    X_CN = camera.X_CW @ body.kinematics.poses(values)
-    outlines = [outline_from_mesh(node.mesh) for node in body.tree.nodes]
-    np.testing.assert_array_equal(every >= 0, draw_mask(outlines, X_CN, camera))
-    assert {*np.unique(every)} == {-1, *range(len(names))}
-    some = body_drawer(body.tree, names[2:])(camera, values)
-    np.testing.assert_array_equal(some >= 0, draw_mask(outlines[2:], X_CN[2:], camera))
-    # A node keeps its place among those shown.
-    np.testing.assert_array_equal((every >= 2) & (some != every - 2), np.zeros_like(every, bool))

@@ -21,7 +21,6 @@ from drake_pose.errors import DrakePoseError, RegistrationError, listed, noted_w
 from drake_pose.files.folder import read_summary, write_summary, writes_folder
 from drake_pose.files.records import mask_digests, user_units
 from drake_pose.files.settings import AuditSettings, percent
-from drake_pose.jobs.estimate.measurements import left_out_warnings
 from drake_pose.jobs.registration.diagnosis import compare_camera, compare_clock
 from drake_pose.jobs.registration.inputs import RegistrationInputs, on_link, read_inputs
 from drake_pose.jobs.registration.large_errors import SceneComparison, SceneFit
@@ -41,6 +40,7 @@ from drake_pose.jobs.registration.tracks import (
     register_on_link,
     register_recordings,
     say_refused,
+    track_warnings,
     turn_of,
     watch_cameras,
 )
@@ -120,11 +120,11 @@ def audit_scene(
         inputs = watch_cameras(read_inputs(Path(scene), Path(model), table, file, settings))
         noted += (*inputs.warnings, *still_joints(inputs.mapped, inputs.model))
         pictures, tracks = _Pictures(), dict[str, TrackRegistration]()
-        frames, findings, given = list[FrameDiagnosis](), list[Finding](), inputs
+        frames, findings, of_links = list[FrameDiagnosis](), list[Finding](), list[str]()
         standing = [one.name for one in inputs.searched_cameras if one.name not in inputs.links]
-        compared, refused = None, {**inputs.riding}
+        compared, refused, given = None, {**inputs.riding}, inputs
         if inputs.links or inputs.riding:
-            tracks, frames, findings = _find_on_links(inputs, settings, refused)
+            tracks, frames, findings, of_links = _find_on_links(inputs, settings, refused)
             given = inputs.of_cameras([name for name in standing if name not in inputs.riding])
         if not inputs.recordings:
             compared = SceneComparison(inputs, on_frame).run()
@@ -136,15 +136,12 @@ def audit_scene(
     common = [Finding("refused", name, text=say_refused(why)) for name, why in refused.items()]
     common += [*pictures.findings, *findings, *found.common]
     found = replace(found, common=tuple(common), frames=(*found.frames, *frames))
-    forgotten = [
-        name for name in standing if inputs.recordings and name not in {*pictures.found, *refused}
-    ]
-    seconds = time.perf_counter() - begin
-    warnings = [*inputs.warnings, *(compared.warnings if compared else ())]
+    warnings = [*inputs.warnings, *of_links, *(compared.warnings if compared else ())]
     warnings += _audit_warnings(inputs, found, empty)
     warnings += [
         f"camera '{name}' was not audited: no pose of it is given; drake-pose register finds it"
-        for name in forgotten
+        for name in standing
+        if inputs.recordings and name not in {*pictures.found, *refused}
     ]
     units = zip(inputs.model.position_names, user_units(inputs.model), strict=True)
     least, center = found.minimum_detectable, found.center
@@ -161,7 +158,7 @@ def audit_scene(
             if name in least
         },
         "principal_point_px": center and dict(zip(("offset", "sd"), center, strict=True)),
-        **describe_run(inputs, settings, warnings, seconds),
+        **describe_run(inputs, settings, warnings, time.perf_counter() - begin),
         "unseen": list(empty),
     }
     kinds = dict(zip(inputs.model.position_names, inputs.model.position_kinds, strict=True))
@@ -202,16 +199,16 @@ class _Pictures:
 
 def _find_on_links(
     inputs: RegistrationInputs, settings: AuditSettings, refused: dict[str, RegistrationError]
-) -> tuple[dict[str, TrackRegistration], list[FrameDiagnosis], list[Finding]]:
+) -> tuple[dict[str, TrackRegistration], list[FrameDiagnosis], list[Finding], list[str]]:
     """Register each camera of an episode that rides on a link, and compare it with its given pose.
 
     refused: output: by camera, the error if no pose explains its pictures.
 
     Returns the registrations by camera; for each of their pictures the fraction of its points that
-    fits, as a diagnosis; and the findings: poses that differ from the given ones.
+    fits, as a diagnosis; the findings: poses that differ from the given ones; and warnings.
     """
     tracks, frames = dict[str, TrackRegistration](), list[FrameDiagnosis]()
-    findings = list[Finding]()
+    findings, warnings = list[Finding](), list[str]()
     for name, link in inputs.links.items():
         own, asked = on_link(inputs, name, settings)
         try:
@@ -226,10 +223,15 @@ def _find_on_links(
         if name in {one.name for one in inputs.given_cameras}:
             text = f"camera '{name}' has an X_WC, but moves with link '{link}': give link and X_LC"
             findings.append(Finding("reading", text))
+        warnings += track_warnings(result, name in inputs.assumed_focal)
         for one in result.found.frames:
-            ratios = {name: one.inlier_ratio}
-            frames.append(FrameDiagnosis(f"{name}-{one.frame}", ratios, ratios, 0.0, None))
-    return tracks, frames, findings
+            ratios, text = (
+                {name: one.inlier_ratio},
+                f"{percent(one.inlier_ratio)} of its points fit",
+            )
+            off = None if one.is_inlier else Finding("unexplained", name, text=text)
+            frames.append(FrameDiagnosis(f"{name}-{one.frame}", ratios, ratios, 0.0, off))
+    return tracks, frames, findings, warnings
 
 
 def _compare_standing(
@@ -284,7 +286,7 @@ def _find_cameras(
     given_cameras = inputs.given_cameras or inputs.searched_cameras
     alone = len(given_cameras) == 1
     body = RegistrationBody(inputs.tree, inputs.visible_nodes)
-    warnings = left_out_warnings(inputs.recordings, [one.name for one in given_cameras])
+    warnings = list[str]()
     if not inputs.given_cameras:
         named = listed([one.name for one in given_cameras])
         warnings.append(

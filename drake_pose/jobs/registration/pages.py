@@ -269,11 +269,13 @@ def audit_page(
     """
     findings, frames = summary["findings"], summary["frames"]
     names = list(dict.fromkeys(name for one in frames.values() for name in one["fits"]))
+    riding = [name for name, one in summary["found_cameras"].items() if "link" in one]
     wrong_first = sorted(frames, key=lambda frame: frames[frame]["agrees"])
-    pictures: dict[str, list[Figure]] = {AS_GIVEN: [], OVERLAY: []}
-    for kind, name in product(pictures, names):
+    pictures: dict[str, list[Figure]] = {AS_GIVEN: [], OVERLAY: [], "points": []}
+    for kind, name in product((AS_GIVEN, OVERLAY), names):
         places = {f"{kind}/{name}/{frame}.png": f"{name}, frame {frame}" for frame in wrong_first}
-        pictures[kind] += picture_files(folder, places, most=most)
+        section = "points" if kind == OVERLAY and name in riding else kind
+        pictures[section] += picture_files(folder, places, most=most)
     offsets = summary["minimum_detectable"]
     joints = []
     for name in kinds:
@@ -315,6 +317,7 @@ def audit_page(
             "errors": errors,
             "as_given": [pictures[AS_GIVEN]],
             "outliers": [pictures[OVERLAY]],
+            "points": [pictures["points"]],
             "audited_joints": [Table(
                 ["joint", "correction, 95 % interval", "minimum detectable offset"], joints
             )],

@@ -407,23 +407,18 @@ def draw_tracks(
     With it, the points as seen from there (blue) and from the pose found (orange) are drawn, too.
     most: number of pictures. prefix: of the files' names, before the frame's.
     """
-    camera, frames = result.found.camera.name, result.found.frames
+    found, frames, blue = result.found.camera, result.found.frames, (0, 114, 178)
     worst = sorted(range(len(frames)), key=lambda k: frames[k].inlier_ratio)
     for k in evenly_spaced(worst, most):
-        name = frames[k].frame
-        picture = result.pictures[name].copy()
-        rows = result.seen.frames == k
-        for (u, v), fits in zip(result.seen.uv[rows], result.inliers[rows], strict=True):
-            colour = (0, 114, 178) if fits else EXCESS_RGB
-            place = round(float(u)), round(float(v))
-            cv2.circle(picture, place, 4, colour, 2, cv2.LINE_AA)
-        write_file(folder, f"{OVERLAY}/{camera}/{prefix}{name}.png", encode_png(picture))
-        if given is None:
-            continue
-        picture = result.pictures[name].copy()
-        for one, colour in ((given, (0, 114, 178)), (result.found.camera, EXCESS_RGB)):
-            for place in result.points_in(one)[rows & result.inliers]:
-                if np.isfinite(place).all() and np.abs(place).max() < 1e4:
-                    centre = round(float(place[0])), round(float(place[1]))
-                    cv2.circle(picture, centre, 4, colour, 2, cv2.LINE_AA)
-        write_file(folder, f"{AS_GIVEN}/{camera}/{prefix}{name}.png", encode_png(picture))
+        name, rows, uv = frames[k].frame, result.seen.frames == k, result.seen.uv
+        fits, off = rows & result.inliers, rows & ~result.inliers
+        drawn = {OVERLAY: ((uv[fits], blue), (uv[off], EXCESS_RGB))}
+        if given is not None:
+            was, now = (result.points_in(one)[fits] for one in (given, found))
+            drawn[AS_GIVEN] = ((was, blue), (now, EXCESS_RGB))
+        for kind, groups in drawn.items():
+            picture = result.pictures[name].copy()
+            for points, colour in groups:
+                for u, v in points[np.abs(points).max(axis=1) < 1e4].round().astype(int).tolist():
+                    cv2.circle(picture, (u, v), 4, colour, 2, cv2.LINE_AA)
+            write_file(folder, f"{kind}/{found.name}/{prefix}{name}.png", encode_png(picture))

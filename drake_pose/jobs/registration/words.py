@@ -122,7 +122,7 @@ def describe_frame_finding(frame: FrameDiagnosis, found: Finding) -> str:
     pixels = f"which moves outlines by {found.pixels:.1f} pixels"
     if found.kind == "unexplained":
         worst = min(frame.fitted_ratios, key=lambda name: frame.fitted_ratios[name])
-        return (
+        return found.text or (
             f"no positions near the given ones explain it: in camera '{worst}' "
             f"{percent(frame.fitted_ratios[worst])} of the contours fit at best"
         )

@@ -12,17 +12,7 @@ from scipy.special import chdtrc
 
 from drake_pose.arrays import Array
 from drake_pose.errors import listed
-from drake_pose.files.page import (
-    BLUE,
-    NORMAL,
-    Figure,
-    Page,
-    Table,
-    bad,
-    p_value,
-    plot,
-    share,
-)
+from drake_pose.files.page import BLUE, NORMAL, Figure, Page, Table, bad, p_value, plot, share
 from drake_pose.input_files import csv_text
 from drake_pose.registration.diagnosis import DIAGNOSIS
 from drake_pose.registration.online_registration import pose_difference, squared_distance

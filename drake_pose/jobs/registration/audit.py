@@ -1,8 +1,8 @@
 """Audit a scene or an episode: find errors of joints, cameras, clocks, and outlier frames.
 
 In an episode each camera is first registered from its pictures, with its clock. This gives masks
-that do not depend on the given pose. If the given pose is far from the registered pose, that is a
-finding, and frames are compared with the registered pose; otherwise with the given pose.
+that do not depend on the given pose. If the given pose differs significantly from the registered
+pose, that is a finding, and frames are compared with the registered pose; otherwise with the given.
 """
 
 import math
@@ -16,12 +16,12 @@ import numpy as np
 
 from drake_pose.arrays import Array, Picture
 from drake_pose.body.tree_kinematics import TreeKinematics
-from drake_pose.camera.models import Camera
+from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.errors import DrakePoseError, RegistrationError, listed, noted_warnings
 from drake_pose.files.folder import read_summary, write_summary, writes_folder
 from drake_pose.files.records import mask_digests, user_units
 from drake_pose.files.settings import AuditSettings, percent
-from drake_pose.jobs.registration.diagnosis import compare_camera, compare_clock
+from drake_pose.jobs.registration.diagnosis import base_motion, compare_camera, compare_clock
 from drake_pose.jobs.registration.inputs import RegistrationInputs, on_link, read_inputs
 from drake_pose.jobs.registration.large_errors import SceneComparison, SceneFit
 from drake_pose.jobs.registration.pages import audit_answer, audit_page
@@ -54,7 +54,7 @@ from drake_pose.registration.diagnosis import DIAGNOSIS
 from drake_pose.registration.findings import Diagnosis, Finding, FrameDiagnosis
 from drake_pose.registration.picture_acceptance import PictureRegistration, evaluate_pictures
 from drake_pose.registration.posed_frames import MultiViewFrame, PosedFrame
-from drake_pose.registration.register import RegistrationBody
+from drake_pose.registration.register import RegisteredCamera, RegistrationBody
 from drake_pose.registration.track_registration import TrackRegistration
 from drake_pose.silhouette.pictures.scene_checks import frame_ranges
 from drake_pose.workers import use_workers
@@ -247,7 +247,7 @@ def _compare_standing(
     Returns the inputs of the found cameras, their registrations, and what was compared; None: no
     camera is found.
     """
-    inputs, pictures = _find_cameras(given, refused, others=near)
+    inputs, pictures = _find_cameras(given, refused, near=near)
     compared = SceneComparison(inputs, on_frame).run() if pictures.found else None
     common = compared.found.common if compared else ()
     offset_joints = [k.name for k in common if k.kind == "joint"]
@@ -255,6 +255,11 @@ def _compare_standing(
         # Masks were segmented with wrong offsets, so they are made again.
         inputs, pictures = _find_cameras(given, refused, pictures, offset_joints)
         compared = SceneComparison(inputs).run() if pictures.found else None
+    if compared is not None:
+        # Edges of masks cut from pictures can err alike in all frames, so cameras are judged by
+        # the pictures' likelihood alone.
+        kept = tuple(one for one in compared.found.common if one.kind not in ("camera", "base"))
+        compared = replace(compared, found=replace(compared.found, common=kept))
     return inputs, pictures, compared
 
 
@@ -263,8 +268,7 @@ def _find_cameras(
     refused: dict[str, RegistrationError],
     before: _Pictures | None = None,
     offset_joints: Sequence[str] = (),
-    near: float = 0.08,
-    others: Path | None = None,
+    near: Path | None = None,
 ) -> tuple[RegistrationInputs, _Pictures]:
     """Register each camera of an episode from its pictures, and segment all pictures.
 
@@ -273,9 +277,7 @@ def _find_cameras(
         refused: output: by camera, the error if no pose explains its pictures.
         before: an earlier result, from which fits start; None: poses are searched.
         offset_joints: names of the joints whose offsets are fitted.
-        near: frames are compared with the given camera if the body's points in its pictures are
-            nearer than this to those at the registered pose [square root of the silhouettes' area].
-        others: as `near` of ``audit_scene``.
+        near: as of ``audit_scene``.
 
     Returns:
         the inputs as a scene of masks, and the registrations. In the inputs each picture is a frame
@@ -288,13 +290,13 @@ def _find_cameras(
     body = RegistrationBody(inputs.tree, inputs.visible_nodes)
     warnings = list[str]()
     if not inputs.given_cameras:
-        named = listed([one.name for one in given_cameras])
         warnings.append(
-            f"no X_WC is given of camera {named}: it was searched, and joints, clock and frames "
-            "are compared with the pose found"
+            f"no X_WC is given of camera {listed([one.name for one in given_cameras])}: it was "
+            "searched, and joints, clock and frames are compared with the pose found"
         )
     compared, findings = list[Camera](), list[Finding]()
     names, frames = dict[str, tuple[str, str]](), list[MultiViewFrame]()
+    misplaced = list[tuple[PinholeCamera, RegisteredCamera]]()
     placed = {camera.name for camera in given_cameras} if before is None else before.found
     searched = [camera for camera in inputs.searched_cameras if camera.name in placed]
     pictures = {
@@ -306,7 +308,7 @@ def _find_cameras(
             refused,
             offset_joints=offset_joints,
             before=None if before is None else before.found,
-            near=None if others is None else _found_poses(others),
+            near=None if near is None else _found_poses(near),
         )
     }
     for camera in inputs.searched_cameras:
@@ -318,28 +320,31 @@ def _find_cameras(
     for given in (camera for camera in given_cameras if camera.name in pictures):
         name, recording, result = given.name, inputs.recordings[given.name], pictures[given.name]
         values = np.array([frame.values + result.joint_offsets for frame in result.frames])
-        is_near = bool(inputs.given_cameras)
-        if inputs.given_cameras:
-            difference = compare_camera(body, given, result.found, values, alone)
-            is_near = difference.pixels < near * result.fit.fit.views[0].size
-            is_off = not is_near and difference.p_value <= DIAGNOSIS.significance
-            findings += [difference] if is_off else []
-        compared.append(given if is_near else result.found.camera)
+        known = given if inputs.given_cameras else result.found.camera
+        difference = compare_camera(body, known, result.found, values, alone)
+        if difference.p_value <= DIAGNOSIS.significance:
+            findings.append(difference)
+            misplaced.append((given, result.found))
+            known = result.found.camera
+        compared.append(known)
         findings += compare_clock(body, result, recording)
         segmented, _, lost = evaluate_pictures(body, result, result.found)
         for frame in segmented:
-            known = frame.name if alone else f"{name}-{frame.name}"
-            names[known] = name, frame.name
-            frames.append(MultiViewFrame(known, frame.values, {name: frame.mask}))
-        if lost:
-            warnings.append(lost_frames_warning(name, lost, recording.names))
-    misplaced = {finding.name for finding in findings if finding.kind == "camera"}
+            frame_name = frame.name if alone else f"{name}-{frame.name}"
+            names[frame_name] = name, frame.name
+            frames.append(MultiViewFrame(frame_name, frame.values, {name: frame.mask}))
+        warnings += [lost_frames_warning(name, lost, recording.names)] if lost else []
+    base = base_motion(misplaced) if len(misplaced) == len(compared) else None
+    if base is not None:
+        off = [one for one in findings if one.kind == "camera"]
+        base = replace(base, pixels=max(one.pixels for one in off))
+        findings = [base, *(one for one in findings if one not in off)]
     updated = replace(
         inputs,
         scene=replace(inputs.scene, frames=tuple(names)),
         warnings=(*inputs.warnings, *warnings),
         known_cameras=tuple(compared),
-        given_cameras=tuple(camera for camera in inputs.given_cameras if camera.name in misplaced),
+        given_cameras=tuple(given for given, _ in misplaced),
         audited_frames=tuple(names),
         frames=tuple(frames),
     )
@@ -446,14 +451,9 @@ def _describe_findings(found: Diagnosis) -> list[dict[str, Any]]:
     """
     rows = [(one, one.kind, one.name, describe_common_finding(one)) for one in found.common]
     rows += [
-        (
-            frame.finding,
-            "frame",
-            frame.frame,
-            f"frame '{frame.frame}': {describe_frame_finding(frame, frame.finding)}",
-        )
-        for frame in sorted(found.frames, key=lambda frame: -frame.pixels)
-        if frame.finding is not None and frame.finding not in found.common
+        (off, "frame", one.frame, f"frame '{one.frame}': {describe_frame_finding(one, off)}")
+        for one in sorted(found.frames, key=lambda one: -one.pixels)
+        if (off := one.finding) is not None and off not in found.common
     ]
     described = []
     for finding, what, name, text in rows:

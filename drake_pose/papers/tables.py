@@ -26,9 +26,6 @@ def uncounted(_what: str, _total: int) -> Advance:
     return lambda _done: None
 
 
-_UNKNOWN = "not given"
-
-
 def figure_table(
     title: str,
     rows: Mapping[str, tuple[str, str]],
@@ -40,7 +37,7 @@ def figure_table(
     Args:
         title: of the table.
         rows: label and format of each figure, by key.
-        columns: figures by heading. A figure that is missing, None or nan is "not given".
+        columns: figures by heading. A figure that is missing, None or nan is "-".
         heading: of the labels' column.
     """
     table = Table(title=title)
@@ -51,7 +48,7 @@ def figure_table(
         if any(key in one for one in columns.values()):
             values = [one.get(key) for one in columns.values()]
             # Only nan differs from itself.
-            cells = (_UNKNOWN if one is None or one != one else form.format(one) for one in values)
+            cells = ("-" if one is None or one != one else form.format(one) for one in values)
             table.add_row(escape(label), *cells)
     return table
 
@@ -64,7 +61,7 @@ def save_page(folder: Path, shown: Sequence[Table | str], warnings: Sequence[str
         columns = ([render(str(cell)).plain for cell in column.cells] for column in table.columns)
         rows, title = [list(row) for row in zip(*columns, strict=True)], str(table.title)
         sections[title] = [PageTable(head, rows)]
-        for label, *cells in (row for row in rows if _UNKNOWN not in row):
+        for label, *cells in (row for row in rows if "-" not in row):
             values = (f"{cell} ({name})" for name, cell in zip(head[1:], cells, strict=True))
             answers.append(f"{label.strip()}: {', '.join(values)}")
     drawn = {one.name: one.stem.replace("_", " ") for one in sorted(folder.glob("*.png"))}

@@ -11,7 +11,7 @@ import argparse
 import csv
 import json
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -44,25 +44,15 @@ _CAMERAS_OFF = 1.4
 
 
 class CoverageSet(NamedTuple):
-    """Scenes of one kind, the settings of their estimates, and the joints that are evaluated.
-
-    Args:
-        name: name of the set.
-        model: model file.
-        make: renders the n-th scene into a folder, or returns an existing scene.
-        joints: prefixes of the names of evaluated joints.
-        settings: settings of the estimate.
-        draws: maximum number of scenes; None: as given on the command line.
-        in_degrees: whether the true angles are in degrees.
-    """
+    """Scenes of one kind."""
 
     name: str
     model: Path
-    make: Callable[[Path, int], Path]
-    joints: tuple[str, ...]
+    make: Callable[[Path, int], Path]  # Renders the n-th scene, or returns an existing one.
+    joints: tuple[str, ...]  # Prefixes of the names of evaluated joints.
     settings: EstimateSettings = EstimateSettings()
-    draws: int | None = None
-    in_degrees: bool = False
+    draws: int | None = None  # Maximum number of scenes; None: as given on the command line.
+    in_degrees: bool = False  # Whether the true angles are in degrees.
 
 
 class Evaluation(NamedTuple):
@@ -172,7 +162,7 @@ def _draw_arm(
         q = np.tile(model.default_positions, (_FRAMES, 1))
         limits = model.lower[moving], model.upper[moving]
         q[:, moving] = swinging(*limits, _FRAMES, rng)
-        return _draw(folder, model, cameras, q, rng, damage, cameras_off, colours)
+        return draw_scene(folder, model, cameras, q, rng, damage, cameras_off, colours)
 
     return make
 
@@ -191,13 +181,13 @@ def _draw_person(damage: Damage) -> Callable[[Path, int], Path]:
         q = np.tile(model.default_positions, (_FRAMES, 1))
         q[:, swung] = swinging(lower[swung], upper[swung], _FRAMES, rng, 1.5)
         q[:, model.position_index("position_z")] = 1.55
-        return _draw(folder, model, cameras, q, rng, damage)
+        return draw_scene(folder, model, cameras, q, rng, damage)
 
     return make
 
 
-def _draw(
-    folder: Path, model: ArticulatedModel, cameras: dict[str, PinholeCamera], q: Array,
+def draw_scene(
+    folder: Path, model: ArticulatedModel, cameras: Mapping[str, PinholeCamera], q: Array,
     rng: np.random.Generator, damage: Damage | None = None, cameras_off: float = 0.0,
     colours: bool = False,
 ) -> Path:  # fmt: skip
@@ -247,7 +237,7 @@ def _with_orientation_error(
 def evaluate_result(out: Path, scene: Path, joints: Sequence[str], in_degrees: bool) -> Evaluation:
     """Return the intervals in a result's files, compared with the scene's truth."""
     unit = 1.0 if in_degrees else np.degrees(1.0)
-    truth = {int(row["frame"]): row for row in _rows(scene / "joint_angles.csv")}
+    truth = true_positions(scene)
     frames = json.loads((out / "summary.json").read_text())["frames"]
     lost = {name for name, one in frames.items() if not one["found"]}
     inside, determined, width, angles, wrong = [], [], [], [], set()
@@ -256,7 +246,7 @@ def evaluate_result(out: Path, scene: Path, joints: Sequence[str], in_degrees: b
         if true is None or not row["joint"].startswith(tuple(joints)) or row["frame"] in lost:
             continue
         is_angle = "position_" not in row["joint"] and "finger" not in row["joint"][:12]
-        value = unit * float(true) if is_angle else float(true)
+        value = unit * true if is_angle else true
         low, high = float(row["low"]), float(row["high"])
         inside.append(low <= value <= high)
         determined.append(row["determined"] == "yes")
@@ -267,6 +257,12 @@ def evaluate_result(out: Path, scene: Path, joints: Sequence[str], in_degrees: b
             wrong.add(row["frame"])
     arrays = (np.array(one) for one in (inside, determined, width, angles))
     return Evaluation(*arrays, len(wrong))
+
+
+def true_positions(scene: Path) -> dict[int, dict[str, float]]:
+    """Return the true joint positions of a scene by frame number."""
+    rows = [{k: float(v) for k, v in row.items()} for row in _rows(scene / "joint_angles.csv")]
+    return {int(row.pop("frame")): row for row in rows}
 
 
 def _rows(path: Path) -> Iterator[dict[str, str]]:

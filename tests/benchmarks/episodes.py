@@ -58,25 +58,18 @@ _BETWEEN = 0.15
 
 
 class EpisodeSet(NamedTuple):
-    """Episodes with one kind of error: time offset, log rate, joint offsets, or wrong rows.
-
-    Attributes:
-        off: bound of the offsets of all joints [deg]; zeros: offsets of three joints.
-        codec: encoder of the pictures' video, with its option `crf`; "": PNG files.
-        small: as of ``simulate``.
-        cause: pattern of words that name what is wrong, if no pose explains the episode.
-    """
+    """Episodes with one kind of error."""
 
     name: str
-    late: bool = False
+    late: bool = False  # A time offset.
     log_hz: float = LOG_HZ
-    zeros: bool = False
-    wrong: bool = False
-    off: float = 0.0
-    codec: str = ""
+    zeros: bool = False  # Offsets of three joints.
+    wrong: bool = False  # Wrong rows.
+    off: float = 0.0  # Bound of the offsets of all joints [deg].
+    codec: str = ""  # Encoder of the pictures' video, with its option `crf`; "": PNG files.
     crf: int = 23
-    small: bool = False
-    cause: str = ""
+    small: bool = False  # As of ``simulate``.
+    cause: str = ""  # Pattern of words that name what is wrong, if no pose explains the episode.
 
 
 SETS = (
@@ -107,29 +100,17 @@ SPOILT = tuple(
 
 
 class Outcome(NamedTuple):
-    """Result of an episode; the last five are set by episodes with these errors only.
+    """Result of an episode; the last five are set by episodes with these errors only."""
 
-    Attributes:
-        refusal: message of the error; "": the registration was accepted.
-        seconds: CPU time [s].
-        error: of the camera.
-        cause: whether an error or warning states what is wrong with the episode.
-        clock: error of the time offset [s].
-        zeros: errors of the wrong joint offsets [deg]; without the first joint's.
-        first: error of the first joint's offset [deg]; NaN: it is right, or not determined.
-        false: number of correct joint offsets reported as wrong.
-        named: fractions of wrong and of correct frames reported as outliers.
-    """
-
-    refusal: str
-    seconds: float
+    refusal: str  # Message of the error; "": the registration was accepted.
+    seconds: float  # CPU time.
     error: CameraError = CameraError()
-    cause: bool = False
-    clock: float = np.nan
-    zeros: tuple[float, ...] = ()
-    first: float = np.nan
-    false: int = 0
-    named: tuple[float, float] = (np.nan, np.nan)
+    cause: bool = False  # Whether an error or warning states what is wrong with the episode.
+    clock: float = np.nan  # Error of the time offset [s].
+    zeros: tuple[float, ...] = ()  # Errors of the wrong offsets [deg]; without the first joint's.
+    first: float = np.nan  # Error of that [deg]; NaN: it is right, or not determined.
+    false: int = 0  # Number of correct joint offsets reported as wrong.
+    named: tuple[float, float] = (np.nan, np.nan)  # Parts of wrong, right frames that are outliers.
 
 
 def measure_episode(data: Path, name: str, folder: Path, seed: int, kind: EpisodeSet) -> Outcome:

@@ -6,7 +6,6 @@ demonstration is estimated. ``--hands``: instead, hands with an uncalibrated cam
 """
 
 import argparse
-import csv
 import tempfile
 import time
 from collections.abc import Iterator
@@ -17,18 +16,16 @@ import numpy as np
 
 from drake_pose.body import bundled_model, load_model
 from drake_pose.files.settings import EstimateSettings
-from drake_pose.input_files import csv_text
 from drake_pose.jobs.demo import demo_settings, stored_scene
 from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.papers.kameda import continuous_figures, experiment_tree, run_experiment
 from drake_pose.search import MultiStartSearch
-from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.scenes import load_scene
+from tests.benchmarks.coverage import draw_scene, true_positions
 from tests.benchmarks.speed import measure_kernel
 from tests.benchmarks.tables import print_table
-from tests.written_files import write_mask
 
-_FRAMES, _RATE_HZ, _IMAGES = 24, 30.0, 20
+_FRAMES, _IMAGES = 24, 20
 _RIGHT_HAND = bundled_model("hand").with_name("right_hand.urdf")
 _ARM_JOINTS = ("A1", "A2", "A3", "A4")
 _FLEXIONS = tuple(
@@ -39,22 +36,14 @@ _FLEXIONS = tuple(
 
 
 class Work(NamedTuple):
-    """An estimate of a scene, one row of the table.
-
-    Attributes:
-        name: name of the row.
-        scene, model: scene folder and model file.
-        settings: settings of the estimate.
-        uncounted: number of initial frames that are not evaluated, because they include the search.
-        joints: joints whose errors are evaluated, by joint_angles.csv in the scene.
-    """
+    """An estimate of a scene, one row of the table."""
 
     name: str
     scene: Path
     model: Path
     settings: EstimateSettings = EstimateSettings()
-    uncounted: int = 0
-    joints: tuple[str, ...] = ()
+    uncounted: int = 0  # Number of initial frames that include the search, and do not count.
+    joints: tuple[str, ...] = ()  # Whose errors are evaluated, by joint_angles.csv in the scene.
 
 
 def works(data: Path | None, folder: Path) -> Iterator[Work]:
@@ -85,30 +74,13 @@ def works(data: Path | None, folder: Path) -> Iterator[Work]:
 def draw_arm_sequence(arm: Path, out: Path, frames: int = _FRAMES) -> Path:
     """Write a scene of the recorded arm moving from its first to its second pose, by Drake."""
     model, scene = load_model(arm / "med7" / "med7.urdf", check=False), load_scene(arm)
-    truth = _truth(arm)
-    names, poses = list(truth[0]), np.array([list(truth[k].values()) for k in (0, 1)])
+    truth = true_positions(arm)
+    first, second = (np.array([*truth[k].values()]) for k in (0, 1))
     share = 0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, frames))
-    path = poses[0] + share[:, None] * (poses[1] - poses[0])
-    out.mkdir()
-    (out / "cameras.yaml").write_bytes((arm / "cameras.yaml").read_bytes())
-    (out / "scene.yaml").write_text(f"sequence: true\nframe_rate_hz: {_RATE_HZ:.0f}\n")
-    rows = [["frame", *names], *([k, *values] for k, values in enumerate(path))]
-    (out / "joint_angles.csv").write_text(csv_text(rows))
-    for name, camera in scene.cameras.items():
-        renderer = LabelRenderer(model, camera)
-        (out / "masks" / name).mkdir(parents=True)
-        for k, values in enumerate(path):
-            q = np.array(model.default_positions)
-            q[[model.position_index(name) for name in names]] = values
-            write_mask(out / "masks" / name / f"{k:04d}.png", renderer.mask(q))
-    return out
-
-
-def _truth(scene: Path) -> dict[int, dict[str, float]]:
-    """Return the true joint positions by frame number."""
-    with (scene / "joint_angles.csv").open(encoding="utf-8", newline="") as file:
-        rows = [{name: float(cell) for name, cell in row.items()} for row in csv.DictReader(file)]
-    return {int(row.pop("frame")): row for row in rows}
+    q = np.tile(model.default_positions, (frames, 1))
+    moving = [model.position_index(name) for name in truth[0]]
+    q[:, moving] = first + share[:, None] * (second - first)
+    return draw_scene(out, model, scene.cameras, q, np.random.default_rng(0))
 
 
 def measure(work: Work) -> tuple[float, float, str]:
@@ -122,7 +94,7 @@ def measure(work: Work) -> tuple[float, float, str]:
         )  # fmt: skip
     rows, error = list(found.records.values())[work.uncounted :], ""
     if work.joints:
-        truth, names = _truth(work.scene), found.position_names
+        truth, names = true_positions(work.scene), found.position_names
         pairs = [(row, name) for row in rows for name in work.joints]
         off = np.abs([r.q[names.index(n)] - truth[int(r.frame)][n] for r, n in pairs])
         # Larger errors are mirrored poses with the same silhouette; they are left out.
@@ -155,7 +127,7 @@ def _hand_rows(data: Path) -> Iterator[tuple[str, ...]]:
     for scene in sorted(path.parent for path in data.glob("*/scene.yaml")):
         begin = time.process_time()
         found = estimate_scene(scene, _RIGHT_HAND, None, EstimateSettings(), overlay=False)
-        seconds, truth = time.process_time() - begin, _truth(scene)
+        seconds, truth = time.process_time() - begin, true_positions(scene)
         off, inside, widths = [], [], []
         for row in found.records.values():
             known, true = row.joints, truth[int(row.frame)]

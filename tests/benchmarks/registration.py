@@ -67,20 +67,13 @@ _BOXES = (
 
 
 class CameraError(NamedTuple):
-    """Error of a registered camera.
-
-    Attributes:
-        millimetres, degrees: position and orientation error.
-        inside: number of the pose's six coordinates inside their 95 % intervals.
-        probable: probability of a larger error, by the pose's covariance.
-        sd: standard deviations of position and orientation, root mean square [mm, deg].
-    """
+    """Error of a registered camera."""
 
     millimetres: float = np.inf
     degrees: float = np.inf
-    inside: int = 0
-    probable: float = 0.0
-    sd: tuple[float, float] = (np.inf, np.inf)
+    inside: int = 0  # Number of the pose's six coordinates inside their 95 % intervals.
+    probable: float = 0.0  # Probability of a larger error, by the pose's covariance.
+    sd: tuple[float, float] = (np.inf, np.inf)  # Of position and orientation, RMS [mm, deg].
 
     @classmethod
     def of(cls, found: RegisteredCamera, X_WC: Array) -> "CameraError":
@@ -94,17 +87,11 @@ class CameraError(NamedTuple):
 
 
 class CameraOutcome(NamedTuple):
-    """Result of one registration.
-
-    Attributes:
-        error: of the camera.
-        named: whether exactly the wrong frames are reported as outliers.
-        seconds: CPU time [s].
-    """
+    """Result of one registration."""
 
     error: CameraError
-    named: bool
-    seconds: float
+    named: bool  # Whether exactly the wrong frames are reported as outliers.
+    seconds: float  # CPU time.
 
     @property
     def found(self) -> bool:

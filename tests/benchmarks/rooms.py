@@ -40,21 +40,13 @@ _NOISE = 4.0
 
 @dataclass(frozen=True, eq=False)
 class SimulatedEpisode:
-    """Images of an arm, and a joint log.
+    """Images of an arm, and a joint log."""
 
-    Attributes:
-        pictures: (f, H, W, 3) images.
-        times: (f,) their times [s].
-        log_times: (n,) times of the joint log [s].
-        positions: (n, nq) joint positions [rad or m].
-        camera: the true camera.
-    """
-
-    pictures: NDArray[np.uint8]
-    times: Array
-    log_times: Array
-    positions: Array
-    camera: PinholeCamera
+    pictures: NDArray[np.uint8]  # (f, H, W, 3)
+    times: Array  # (f,) of the images [s].
+    log_times: Array  # (n,) of the joint log [s].
+    positions: Array  # (n, nq) [rad or m].
+    camera: PinholeCamera  # The true one.
 
 
 class Room:

@@ -31,17 +31,11 @@ _LINK = """
 
 
 class CameraFigures(NamedTuple):
-    """Comparison of both cameras.
+    """Comparison of both cameras."""
 
-    Attributes:
-        ours, drakes: mean CPU time per image of SilhouetteCamera and RgbdSensor, including poses
-            [s].
-        worst, mean: fraction of the body's pixels with different labels.
-    """
-
-    ours: float
-    drakes: float
-    worst: float
+    ours: float  # Mean CPU time per image of SilhouetteCamera, including poses [s].
+    drakes: float  # The same of RgbdSensor.
+    worst: float  # Fraction of the body's pixels with different labels.
     mean: float
 
 

@@ -41,17 +41,11 @@ _CAMERAS, _FRAMES = (4, 8, 16), 12
 
 
 class KernelFigures(NamedTuple):
-    """Times for one segment.
-
-    Attributes:
-        triangles: number of triangles.
-        kernel_microseconds: time to score one candidate against two sets.
-        label_image_microseconds: time of one Drake label image.
-    """
+    """Times for one segment."""
 
     triangles: int
-    kernel_microseconds: float
-    label_image_microseconds: float
+    kernel_microseconds: float  # To score one candidate against two sets.
+    label_image_microseconds: float  # Of one Drake label image.
 
 
 def measure_kernel(columns: int = 14, rows: int = 16, seed: int = 0) -> KernelFigures:

@@ -1,8 +1,5 @@
 """What benchmarks render, damage and measure."""
 
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 from scipy import ndimage
@@ -14,8 +11,6 @@ from tests.benchmarks import figures, memory, registration, rooms
 from tests.benchmarks.tables import print_table
 from tests.body.models import joint, link, urdf, write
 from tests.registration.arm_pictures import damaged
-
-MIB = 2**20
 
 
 def test_damage_moves_the_edge_by_two_pixels_at_most_and_cuts_holes():
@@ -42,34 +37,6 @@ def test_pose_errors_are_recovered():
     found[:3, 3] -= [0.1, 0.2, 0.3]
     expected = [0.01, -0.02, 0.03, 0.1, 0.2, 0.3]
     np.testing.assert_allclose(registration.pose_error(found, true), expected, atol=1e-12)
-
-
-@pytest.mark.slow
-def test_a_simulated_camera_is_found(tmp_path):
-    arm = registration.load_arm(registration.write_box_arm(tmp_path / "boxes.urdf"))
-    exact, worn = (registration.measure_camera(arm, 1, worn) for worn in (False, True))
-    assert all(outcome.found and outcome.named for outcome in (exact, worn))
-    assert exact.error.millimetres < 5.0
-
-
-@pytest.mark.slow
-def test_memory_is_that_of_the_process():
-    """Measured by a small process: a child is never reported below its parent's own peak."""
-    program = (
-        "import sys; from pathlib import Path; from tests.benchmarks.memory import measure_memory;"
-        f"grow = 'import sys; b = b\"x\" * (int(sys.argv[1]) * {MIB}); sys.exit(3)';"
-        "print(*measure_memory(sys.argv[1:], Path.cwd(), ('-c', grow))[:2])"
-    )
-
-    def measured(size: int) -> float:
-        words = (sys.executable, "-c", program, str(size))
-        status, peak = subprocess.check_output(words, text=True).split()
-        assert status == "3"
-        return float(peak)
-
-    small = measured(100)
-    assert measured(400) - small == pytest.approx(300, abs=15)
-    assert 100 < small < 160
 
 
 def test_commands_of_the_benchmark_exist():

@@ -17,27 +17,16 @@ from tests.benchmarks.rooms import LOG_HZ, Room, SimulatedEpisode, texture_pictu
 
 @dataclass(frozen=True)
 class Gripper:
-    """An arm with a gripper.
+    """An arm with a gripper."""
 
-    Args:
-        file: the model's file in the folder of data.
-        link: the link that carries the camera.
-        arm: joint positions at which the hand looks down on a table, and names of these joints.
-        height: of the table in the robot's base frame [m].
-        fingers: by joint its position when closed and when open [rad or m].
-        reach: distance from the link's origin to the tips of the fingers [m].
-        aside: bounds of the camera's distance from the fingers' axis [m].
-        axis: direction of the fingers in the link's frame.
-    """
-
-    file: str
-    link: str
-    arm: dict[str, float]
-    height: float
-    fingers: dict[str, tuple[float, float]]
-    reach: float
-    aside: tuple[float, float] = (0.06, 0.1)
-    axis: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    file: str  # The model's, in the folder of data.
+    link: str  # That carries the camera.
+    arm: dict[str, float]  # Joint positions at which the hand looks down on a table.
+    height: float  # Of the table in the robot's base frame [m].
+    fingers: dict[str, tuple[float, float]]  # By joint its position closed and open [rad or m].
+    reach: float  # Distance from the link's origin to the tips of the fingers [m].
+    aside: tuple[float, float] = (0.06, 0.1)  # Bounds of the camera's from the fingers' axis [m].
+    axis: tuple[float, float, float] = (0.0, 0.0, 1.0)  # Of the fingers in the link's frame.
 
 
 _PANDA = dict(zip((f"panda_joint{k}" for k in range(1, 8)),

@@ -27,23 +27,14 @@ from tests.benchmarks.wrist_rooms import GRIPPERS, simulate_wrist
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of episode.
-
-    Args:
-        name: in the table.
-        room: arguments of ``simulate_wrist``.
-        off: bound of the offsets of all joints but the first and the last [deg]; they are asked for
-            if it is positive.
-        wrong: what is wrong: "joints", "mirrored", "model" or "link"; "": nothing.
-        right: whether a pose is to be accepted.
-        arms: keys of GRIPPERS.
-    """
+    """A kind of episode."""
 
     name: str
-    room: dict[str, Any] = field(default_factory=dict)
+    room: dict[str, Any] = field(default_factory=dict)  # Arguments of ``simulate_wrist``.
+    # Bound of the offsets of all joints but the first and the last, asked for if positive [deg].
     off: float = 0.0
-    wrong: str = ""
-    right: bool = True
+    wrong: str = ""  # What is wrong: "joints", "mirrored", "model" or "link"; "": nothing.
+    right: bool = True  # Whether a pose is to be accepted.
     arms: tuple[str, ...] = tuple(GRIPPERS)
 
 

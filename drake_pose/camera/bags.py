@@ -115,7 +115,7 @@ def open_bag(path: Path, joints: JointLog | None) -> Episode:
         frame = pictures[topic][0][2]
         link, X_LC = above(parents, frame) if frame in parents else (None, np.eye(4))
         mounted = camera.camera and camera.camera.with_pose(X_LC)
-        cameras[name] = replace(camera, name=name, camera=mounted, link=link)
+        cameras[name] = replace(camera, name=name, camera=mounted, link=link, is_posed=bool(link))
     lacking = (
         f"{path}: has no joint positions; give a table of them (--joints). Wanted is a topic of "
         f"sensor_msgs/JointState with names and positions; the topics are: {_topics(kinds)}"

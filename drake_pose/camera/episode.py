@@ -96,7 +96,7 @@ class Stream:
     height: int
     times: Array  # (n,) ascending times of the images [s]; nan if unknown.
     # Calibrated camera of the undistorted images; None: none was recorded. Its X_WC is the pose in
-    # ``link``; without a link it is unknown, unless ``is_posed``.
+    # ``link`` or the robot's base; unknown, unless ``is_posed``.
     camera: PinholeCamera | None
     # Link on which the camera is mounted, named as in the recording; None: unknown.
     link: str | None
@@ -104,7 +104,7 @@ class Stream:
     read_recorded: Callable[[int], Picture]
     frames: tuple[str, ...] = ()  # (n,) names of the images; empty: they have none.
     lens: Lens | None = None  # Lens that undistorts the images; None: they have no distortion.
-    is_posed: bool = False  # Whether X_WC was recorded, as the pose in the robot's base.
+    is_posed: bool = False  # Whether X_WC was recorded, in the robot's base or in ``link``.
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -233,7 +233,8 @@ def add_calibration(camera: Stream, calibration: CameraFile, path: Path) -> Stre
             f"pictures {camera.width} x {camera.height}: give the calibration of these pictures"
         )
     link, lens = calibration.links.get(camera.name), calibration.lenses.get(camera.name)
-    return replace(camera, camera=found, link=link, lens=lens)
+    is_posed = camera.name not in calibration.unplaced
+    return replace(camera, camera=found, link=link, lens=lens, is_posed=is_posed)
 
 
 def recorded_intrinsics(

@@ -369,7 +369,7 @@ def match_names(logged: Sequence[str], wanted: Sequence[str]) -> tuple[dict[str,
         for name in (*logged, *wanted)
         if (found := re.fullmatch(r"(.*?)[_\-. ]?(\d+)", name.removesuffix(".pos")))
     }
-    series = [name for name in logged if name in starts_of]
+    series = [name for name in logged if name in starts_of and not {*wanted} <= {*logged}]
     starts = {starts_of[name] for name in series}
     if len(series) > 1 and len(starts) == 1 and any(name not in matched for name in series):
         # Names of a series count from 0 or 1: joint_1 of joint_0 to joint_6 is the model's joint2.

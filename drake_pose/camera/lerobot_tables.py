@@ -350,5 +350,4 @@ def with_fields(camera: Stream, fields: Mapping[str, Any], where: str) -> Stream
     lens = lens_of([camera.width, camera.height], matrix, (), "none", f"{where}: camera_intrinsics")
     X_WC = np.eye(4) if pose is None else check_pose(pose, "camera_extrinsics", where)
     found, link = lens.camera(camera.name, X_WC), fields.get("camera_link")
-    is_posed = pose is not None and link is None
-    return replace(camera, camera=found, link=link, is_posed=is_posed)
+    return replace(camera, camera=found, link=link, is_posed=pose is not None)

@@ -216,7 +216,7 @@ def cameras_of(
     chosen = [one for one in episode.cameras.values() if one.name in wanted]
     file = camera_path or episode.path / CAMERA_FILE
     if camera_path is None and not file.is_file():
-        return chosen, frozenset(one.name for one in chosen if one.is_posed), ()
+        return chosen, frozenset(k.name for k in chosen if k.is_posed and k.link is None), ()
     given = load_camera_file(
         file,
         distorted=True,

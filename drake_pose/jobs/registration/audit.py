@@ -59,9 +59,6 @@ from drake_pose.registration.track_registration import TrackRegistration
 from drake_pose.silhouette.pictures.scene_checks import frame_ranges
 from drake_pose.workers import use_workers
 
-OnFrame = Callable[[int], None]
-"""Called with the number of frames that are done."""
-
 
 @dataclass(frozen=True, eq=False)
 class SceneAudit:
@@ -92,7 +89,7 @@ def audit_scene(
     *,
     cameras: Path | str | None = None,
     overlay: bool = True,
-    on_frame: OnFrame | None = None,
+    on_frame: Callable[[int], None] | None = None,
     near: Path | None = None,
 ) -> SceneAudit:
     """Find errors common to all frames, and outlier frames; the time is linear in their number.
@@ -107,7 +104,7 @@ def audit_scene(
         settings: what is audited, and how.
         cameras: a camera file in place of the scene's or episode's own.
         overlay: whether overlays are drawn.
-        on_frame: called after each frame.
+        on_frame: called after each frame, with the number of frames that are done.
         near: result folder of the audit of another episode. Cameras are first sought near the poses
             found there, then everywhere. None: all are sought everywhere.
 
@@ -144,13 +141,23 @@ def audit_scene(
         if inputs.recordings and name not in {*pictures.found, *refused}
     ]
     units = zip(inputs.model.position_names, user_units(inputs.model), strict=True)
+    names = [camera.name for camera in inputs.known_cameras]
     least, center = found.minimum_detectable, found.center
     results: dict[str, PictureRegistration | TrackRegistration] = {**pictures.found, **tracks}
     summary = {
         "findings": _describe_findings(found),
         "frame_count": len(found.frames),
         "agreeing_count": len(found.frames) - len(found.outliers),
-        "frames": {one.frame: _describe_frame(inputs, one) for one in found.frames},
+        "frames": {
+            one.frame: {
+                "agrees": one.finding is None,
+                "fits": dict(one.given_ratios),
+                "fits_when_freed": dict(one.fitted_ratios),
+                "pixels": one.pixels,
+                "masks": mask_digests(inputs.scene, names, one.frame),
+            }
+            for one in found.frames
+        },
         "found_cameras": {k: describe_found(v, given.links.get(k)) for k, v in results.items()},
         "minimum_detectable": {
             name: unit * least[name] if math.isfinite(least[name]) else None
@@ -168,18 +175,6 @@ def audit_scene(
             draw_tracks(folder, result, of, prefix=f"{name}-")
         _write_result(folder, inputs, found, pictures, overlay, summary, kinds)
     return SceneAudit(found, summary, tuple(warnings), audit_answer(summary, kinds), folder)
-
-
-def _describe_frame(inputs: RegistrationInputs, one: FrameDiagnosis) -> dict[str, Any]:
-    """Return the part of summary.json on a frame."""
-    names = [camera.name for camera in inputs.known_cameras]
-    return {
-        "agrees": one.finding is None,
-        "fits": dict(one.given_ratios),
-        "fits_when_freed": dict(one.fitted_ratios),
-        "pixels": one.pixels,
-        "masks": mask_digests(inputs.scene, names, one.frame),
-    }
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,7 +232,7 @@ def _find_on_links(
 def _compare_standing(
     given: RegistrationInputs,
     near: Path | None,
-    on_frame: OnFrame | None,
+    on_frame: Callable[[int], None] | None,
     refused: dict[str, RegistrationError],
 ) -> tuple[RegistrationInputs, _Pictures, SceneFit | None]:
     """Find an episode's cameras that stand still, and compare its frames with them.
@@ -297,8 +292,7 @@ def _find_cameras(
     compared, findings = list[Camera](), list[Finding]()
     names, frames = dict[str, tuple[str, str]](), list[MultiViewFrame]()
     misplaced = list[tuple[PinholeCamera, RegisteredCamera]]()
-    placed = {camera.name for camera in given_cameras} if before is None else before.found
-    searched = [camera for camera in inputs.searched_cameras if camera.name in placed]
+    searched = [one for one in given_cameras if before is None or one.name in before.found]
     pictures = {
         one.found.camera.name: one
         for one in register_recordings(

@@ -249,9 +249,7 @@ def check_focal_length(
     frames: Sequence[PosedFrame],
     *,
     off_by: float = 0.03,
-    off_by_sds: float = 4.0,
     wrong_by: float = 0.06,
-    most: int = 60,
 ) -> tuple[RegisteredCamera, float, list[str]]:
     """Compare a camera's focal length with that estimated from its masks.
 
@@ -259,12 +257,11 @@ def check_focal_length(
         body: the robot's surfaces.
         found: the registered camera, with one misfit for each of `frames`.
         frames: its frames, of which the inliers are used.
-        off_by, off_by_sds: minimum difference of the focal lengths' logarithms for a warning,
-            absolute and in standard deviations. Published focal lengths of recorded arms differ by
-            2 % at most.
+        off_by: minimum difference of the focal lengths' logarithms for a warning, which is also
+            four standard deviations or more. Published focal lengths of recorded arms differ by 2 %
+            at most.
         wrong_by: difference of the logarithms from which the camera gets the estimated focal
             length.
-        most: maximum number of frames in a first, quick estimate.
 
     Returns the camera; the relative standard deviation of an estimated focal length, 0 for a given
     one; and a list of one warning or none. Between `off_by` and `wrong_by` the camera's pose and
@@ -273,7 +270,7 @@ def check_focal_length(
     """
     given = found.camera
     inliers = [frame for frame, fit in zip(frames, found.frames, strict=True) if fit.is_inlier]
-    sample = evenly_spaced(inliers, most)
+    sample = evenly_spaced(inliers, 60)
     if len(sample) < 2:
         return found, 0.0, []
     posed = PosedFrames(body.kinematics, body.full, given, sample)
@@ -284,7 +281,7 @@ def check_focal_length(
     fitted = calibrate_joints(body, [found], [inliers], (), focal=True)
     camera, deviation = fitted.cameras[0], float(fitted.focal_deviations[0])
     log_ratio = math.log(camera.focal_x / given.focal_x)
-    if abs(log_ratio) < max(off_by, off_by_sds * deviation):
+    if abs(log_ratio) < max(off_by, 4.0 * deviation):
         return found, 0.0, []
     text = " A wrong focal length gives a wrong distance; calibrate it"
     if abs(log_ratio) <= wrong_by:
@@ -410,35 +407,33 @@ def _picture_shift(
     return float(np.sqrt(np.fmin(squares, most**2).mean()))
 
 
-def last_before_change(wrong: Sequence[bool], least: int = 2) -> int | None:
+def last_before_change(wrong: Sequence[bool]) -> int | None:
     """Return the index of the last frame before frames change from inliers to outliers, or back.
 
-    ``wrong``: for each frame, whether it is an outlier. ``least``: minimum numbers of outliers and
-    of inliers. Returns the index; None: there is not exactly one change, or there are too few of
-    either.
+    ``wrong``: for each frame, whether it is an outlier. Returns the index; None: there is not
+    exactly one change, or there are fewer than two outliers or inliers.
     """
     turns = np.flatnonzero(np.diff(np.array(wrong, int)))
-    if len(turns) != 1 or min(sum(wrong), len(wrong) - sum(wrong)) < least:
+    if len(turns) != 1 or min(sum(wrong), len(wrong) - sum(wrong)) < 2:
         return None
     return int(turns[0])
 
 
-def base_motion(
-    placed: Sequence[tuple[Camera, RegisteredCamera]], sds: float = 4.0
-) -> Finding | None:
+def base_motion(placed: Sequence[tuple[Camera, RegisteredCamera]]) -> Finding | None:
     """Return the base's motion that explains the motions of all cameras; None: none does.
 
     One camera alone does not tell a motion of the base from its own. The finding's shift is that
     of the world's origin; its pixels and p-value are 0.
 
-    ``placed``: cameras at their given poses, and as registered. ``sds``: maximum difference between
-    the cameras' motions [standard deviations], to which 0.25 degrees and 3 mm are added.
+    The cameras' motions differ by four standard deviations, 0.25 degrees and 3 mm at most.
+
+    ``placed``: cameras at their given poses, and as registered.
     """
     motions = [given.X_WC @ found.camera.X_CW for given, found in placed]
     rotation_sd = max((found.rotation_sd for _, found in placed), default=0.0)
     shift_sd = max((found.translation_sd for _, found in placed), default=0.0)
     differences = [pose_difference(motion, motions[0]) for motion in motions[1:]]
-    most = sds * rotation_sd + np.radians(0.25), sds * shift_sd + 0.003
+    most = 4.0 * rotation_sd + np.radians(0.25), 4.0 * shift_sd + 0.003
     if not differences or any(
         np.linalg.norm(difference[:3]) > most[0] or np.linalg.norm(difference[3:]) > most[1]
         for difference in differences

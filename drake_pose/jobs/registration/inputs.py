@@ -298,12 +298,18 @@ def _read_episode(
     chosen, placed, read = cameras_of(episode, cameras, settings)
     known = {camera.name: camera.pinhole() for camera in chosen}
     links = {one.name: one.link for one in chosen if one.link in robot.link_names}
+    recorded = {one.name for one in chosen if one.is_posed and one.camera is not None}
+    world = make_tree(robot, EstimateSettings(hold=settings.hold)) if links else None
+    for name, X_WL in _still_links(world, links) if world else ():
+        del links[name]
+        if name in recorded:
+            known[name], placed = known[name].with_pose(X_WL @ known[name].X_WC), placed | {name}
     kinematics = TreeKinematics(tree)
     inputs = RegistrationInputs(
         Scene(path, known, (), {}), robot, tree, KnownPositions(path, kinematics, {}),
         joints, cameras, (*warnings, *read), searched_cameras=tuple(known.values()),
         given_cameras=tuple(one for name, one in known.items() if name in placed),
-        links=links, given_on_links=tuple(known[name] for name in links),
+        links=links, given_on_links=tuple(known[name] for name in links if name in recorded),
         assumed_focal=frozenset(camera.name for camera in chosen if camera.camera is None),
         recordings={one.name: _recording(one, mapped, kinematics, settings) for one in chosen},
         visible_nodes=standing or (posed if unposed else None),
@@ -331,6 +337,21 @@ def _read_episode(
         )
     joint_names, link_names = _select_parameters(robot, kinematics, settings)
     return replace(inputs, offset_joints=joint_names, scaled_links=link_names)
+
+
+def _still_links(tree: PoseTree, links: Mapping[str, str]) -> list[tuple[str, Array]]:
+    """Return the cameras on links that stand still, with the pose X_WL (4, 4) of the link.
+
+    tree: the robot's, in the world. links: link of each camera, by the camera's name.
+    """
+    poses, kinematics, plant = list[dict[str, Array]](), TreeKinematics(tree), tree.model.plant
+    default, context = kinematics.flatten(tree.default_values()), plant.CreateDefaultContext()
+    for values in (default, default + 0.5 * (kinematics.lower < kinematics.upper)):
+        q, X_WB = tree.positions_from(kinematics.split(values))
+        plant.SetPositions(context, q)
+        X_BL = {k: plant.GetBodyByName(v).EvalPoseInWorld(context) for k, v in links.items()}
+        poses.append({name: X_WB @ X.GetAsMatrix4() for name, X in X_BL.items()})
+    return [(name, X) for name, X in poses[0].items() if np.allclose(X, poses[1][name])]
 
 
 def _recording(
@@ -497,12 +518,10 @@ def _select_parameters(
     return joints, links
 
 
-def _read_frames(
-    inputs: RegistrationInputs, wanted: Sequence[str], most: int = 12
-) -> tuple[MultiViewFrame, ...]:
+def _read_frames(inputs: RegistrationInputs, wanted: Sequence[str]) -> tuple[MultiViewFrame, ...]:
     """Return the searched cameras' frames, with the known cameras' masks of the same frames.
 
-    With estimated positions at most `most` frames are used: the model's errors are common to all
+    With estimated positions at most twelve frames are used: the model's errors are common to all
     frames, so more frames add little. Empty masks are left out.
 
     wanted: names of the frames to read; empty: all.
@@ -521,7 +540,7 @@ def _read_frames(
                     "with an X_WC determine the body's pose; give synchronised masks"
                 )
         usable = [frame for frame in known if any((name, frame) in scene.masks for name in names)]
-        chosen = np.linspace(0, len(usable) - 1, most).round().astype(int)
+        chosen = np.linspace(0, len(usable) - 1, 12).round().astype(int)
         wanted = tuple(dict.fromkeys(usable[k] for k in chosen))
     shown = {name: scene.of_cameras([name]).frames_with_files(wanted) for name in names}
     views = []

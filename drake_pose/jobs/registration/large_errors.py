@@ -105,10 +105,10 @@ class SceneComparison:
         sample = map(inputs.read, evenly_spaced(inputs.audited_frames, sample_size))
         self._sample = [frame for frame in sample if frame.masks]
 
-    def run(self, most: int = 3) -> SceneFit:
+    def run(self) -> SceneFit:
         """Return the scene's final fit and diagnosis.
 
-        most: maximum number of large errors that are corrected, one after another.
+        At most three large errors are corrected, one after another.
 
         Raises CameraError: a camera cannot show the robot from its given pose; MaskError: no mask
         shows the body.
@@ -120,13 +120,13 @@ class SceneComparison:
             unseen = None if inputs.recordings else self._search_unseen(str(error))
             if unseen is None:
                 raise
-            return self._finish(self._correct(unseen, most - 1))
+            return self._finish(self._correct(unseen, 2))
         given = self._compare(inputs.known_cameras, ())
-        now = self._correct(given, most)
+        now = self._correct(given, 3)
         if now.is_doubtful:
             # Corrections that leave most frames unexplained are dropped.
             placed = None if inputs.recordings else self._compare_registered(given.cameras)
-            now = given if placed is None else self._correct(placed, most)
+            now = given if placed is None else self._correct(placed, 3)
         if now.is_doubtful and not inputs.recordings:
             shift = shift_correction(self.body, given.cameras, self._sample)
             if shift is not None:
@@ -191,13 +191,12 @@ class SceneComparison:
             now = self._record(now, again, correction)
         return self._settle(now)
 
-    def _settle(self, now: SceneFit, most: int = 8, least: float = 0.1) -> SceneFit:
+    def _settle(self, now: SceneFit, least: float = 0.1) -> SceneFit:
         """Return the fit at the corrections that it found: what is wrong is not linear.
 
-        most: maximum number of times that frames are fitted again. least: how far outlines move at
-            least [pixel].
+        least: how far outlines move at least [pixel]; frames are fitted again eight times at most.
         """
-        for _ in range(most):
+        for _ in range(8):
             if now.found.remaining < least:
                 break
             again = self._compare(now.cameras, now.corrections, now.found.corrections)
@@ -279,19 +278,19 @@ class SceneComparison:
         return moved, replace(found, frames=tuple(updated))
 
     def _register(
-        self, frames: Sequence[MultiViewFrame], cameras: Sequence[Camera], least: int = 3
+        self, frames: Sequence[MultiViewFrame], cameras: Sequence[Camera]
     ) -> dict[str, tuple[RegisteredCamera, Finding]]:
         """Register cameras from frames, and return the cameras that differ from their given poses.
 
-        ``frames``: with masks of the cameras. ``cameras``: at their given poses. ``least``: minimum
-        number of frames of each camera; others are left out. Returns by name the registered camera,
-        and a finding of its difference from the given pose.
+        ``frames``: with masks of the cameras. ``cameras``: at their given poses; those with
+        fewer than three frames are left out. Returns by name the registered camera, and a finding
+        of its difference from the given pose.
         """
         search, placed = CameraSearch(self.body), dict[str, tuple[RegisteredCamera, Finding]]()
         for camera in cameras:
             posed = [frame.of(camera.name) for frame in frames if camera.name in frame.masks]
             posed = evenly_spaced(posed, LARGE.frame_count)
-            if not isinstance(camera, PinholeCamera) or len(posed) < least:
+            if not isinstance(camera, PinholeCamera) or len(posed) < 3:
                 continue
             try:
                 found = search.register(camera, posed)

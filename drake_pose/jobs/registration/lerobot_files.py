@@ -39,8 +39,6 @@ def correct_homing(
     offset: float,
     servos: Servos,
     encoding: Encoding,
-    *,
-    most_lost: float = 0.5,
 ) -> HomingCorrection:
     """Return the homing offset with which LeRobot reads the model's angle of a joint.
 
@@ -54,8 +52,6 @@ def correct_homing(
         offset: the joint's offset, to be added to the recorded positions [rad].
         servos: the robot's motors.
         encoding: of the column's readings.
-        most_lost: maximum correction [half the range]; beyond it the model's zero is not meant to
-            be the motor's, as in a model whose limits are all on one side of 0.
     """
     motor, step = servos.motors[motor_name], 2.0 * math.pi / TURN
     before = motor.homing
@@ -71,7 +67,8 @@ def correct_homing(
     middle = 0.5 * (motor.low + motor.high) if encoding == "steps" else 0.0
     zero = column.scale * middle + column.offset + offset
     shift, half = round(sign * zero / step), 0.5 * (motor.high - motor.low)
-    if abs(shift) > most_lost * half:
+    if abs(shift) > 0.5 * half:
+        # Model and motor have unrelated zeros, as in a model with limits on one side of 0.
         reason = (
             f"the middle of its range is {math.degrees(zero):.0f} degrees in the model, too far "
             "from its zero: calibrate it again with the arm in the middle of its range"

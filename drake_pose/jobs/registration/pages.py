@@ -256,16 +256,13 @@ def compared_frames(errors: Mapping[str, float]) -> Sequence[str]:
     return tuple(dict.fromkeys([in_order[0], in_order[len(in_order) // 2]]))
 
 
-def audit_page(
-    folder: Path, summary: Mapping[str, Any], kinds: Mapping[str, str], most: int = 8
-) -> Page:
+def audit_page(folder: Path, summary: Mapping[str, Any], kinds: Mapping[str, str]) -> Page:
     """Return the page of an audit.
 
     Args:
         folder: the result folder, with its pictures.
         summary: content of summary.json.
         kinds: kind of each position by name: "angle", "length" or "quaternion".
-        most: maximum number of frames with pictures, for each camera.
     """
     findings, frames = summary["findings"], summary["frames"]
     names = list(dict.fromkeys(name for one in frames.values() for name in one["fits"]))
@@ -275,7 +272,7 @@ def audit_page(
     for kind, name in product((AS_GIVEN, OVERLAY), names):
         places = {f"{kind}/{name}/{frame}.png": f"{name}, frame {frame}" for frame in wrong_first}
         section = "points" if kind == OVERLAY and name in riding else kind
-        pictures[section] += picture_files(folder, places, most=most)
+        pictures[section] += picture_files(folder, places)
     offsets = summary["minimum_detectable"]
     joints = []
     for name in kinds:

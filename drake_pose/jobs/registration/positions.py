@@ -171,7 +171,7 @@ def own_joints(scene: Path, robot: ArticulatedModel, settings: AuditSettings) ->
 
 
 def still_joints(
-    log: JointLog | None, model: ArticulatedModel, moves: float = 0.2, least: int = 3
+    log: JointLog | None, model: ArticulatedModel, moves: float = 0.2
 ) -> tuple[str, ...]:
     """Return what may be wrong with an episode's log if its pictures are refused.
 
@@ -180,12 +180,11 @@ def still_joints(
     Args:
         log: the log in the model's joints; None: there is none.
         model: the robot.
-        moves: minimum range of the readings of joints that move [rad or m].
-        least: minimum number of such joints.
+        moves: minimum range of the readings of joints that move [rad or m]; three or more do.
     """
     rows = np.zeros((1, 0)) if log is None else log.positions
     ranges = np.fmax.reduce(rows, axis=0) - np.fmin.reduce(rows, axis=0)
-    if log is None or np.count_nonzero(ranges > moves) < least:
+    if log is None or np.count_nonzero(ranges > moves) < 3:
         return ()
     return tuple(
         f"joint '{name}' reads {rows[0, k]:.4g} in all rows of the log, while others move: does "

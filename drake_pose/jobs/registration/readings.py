@@ -34,17 +34,15 @@ def scene_corrections(
     values: Sequence[Array],
     frames: Sequence[str],
     *,
-    pairs: int = 10,
     focal: Sequence[float] = (0.5, 0.6, 0.7, 0.8, 0.9, 1.1, 1.2, 1.4, 2.0),
     sizes: Sequence[float] = (0.25, 1.0 / 3.0, 0.5, 2.0 / 3.0, 0.75, 1.5, 2.0, 3.0, 4.0),
 ) -> Iterator[Correction]:
     """Yield corrections of mistakes that users make; each is to be tried by itself.
 
     Args:
-        cameras: the cameras at their given poses.
+        cameras: the cameras at their given poses; at most ten pairs are exchanged.
         values: for each frame (m,) values of the pose tree [rad or m].
         frames: names of the frames, in order.
-        pairs: maximum number of camera pairs that are exchanged.
         focal: factors of focal lengths.
         sizes: of pictures for which intrinsics may be meant [size of the camera's pictures].
     """
@@ -68,7 +66,7 @@ def scene_corrections(
             rank = reading.steps + 1 - len(group)
             text = f"{whose} seems to be {reading.text}"
             yield Correction("reading", text, _changed(cameras, reread), unchanged, 0.0, rank)
-    for a, b in list(combinations(cameras, 2))[:pairs]:
+    for a, b in list(combinations(cameras, 2))[:10]:
         text = f"cameras '{a.name}' and '{b.name}' seem to be exchanged"
         swapped: dict[str, Camera] = {a.name: a.with_pose(b.X_WC), b.name: b.with_pose(a.X_WC)}
         yield Correction("reading", text, _changed(cameras, swapped), unchanged)
@@ -317,14 +315,13 @@ def likeliest_reading(
     found: Array,
     distance: float,
     *,
-    much_nearer: float = 3.0,
     near: float = 0.15,
     least: float = 0.05,
 ) -> tuple[str, float, float] | None:
     """Return the reading of a given pose that brings it near the pose that was found.
 
-    A reading counts if it is much nearer than the pose as given, and not as near by chance, that
-    is, with a random rotation or position. Of the readings that count, the one with the fewest
+    A reading counts if it is three times nearer than the pose as given, and not as near by chance,
+    that is, with a random rotation or position. Of the readings that count, the one with the fewest
     mistakes is returned, unless another reading is much nearer.
 
     The size of a difference is the norm of its angle [rad] and of its shift over `distance`.
@@ -332,7 +329,6 @@ def likeliest_reading(
     Args:
         given, found: (4, 4) X_WC as given, and as found [m].
         distance: from the camera to the body [m].
-        much_nearer: minimum size of the given pose's difference, over that of the reading's.
         near: maximum size of the reading's difference.
         least: size of the given pose's difference below which it needs no other reading.
 
@@ -364,7 +360,7 @@ def likeliest_reading(
             chance *= (shift / (shift + distance)) ** 3
         alike = sum(other.steps <= reading.steps for other in table)
         its_size = size((angle, shift))
-        if alike * chance < LEVEL and its_size < min(near, as_given / much_nearer):
+        if alike * chance < LEVEL and its_size < min(near, as_given / 3.0):
             counted.append((reading.steps, its_size, reading.text, (angle, shift)))
     if not counted:
         return None

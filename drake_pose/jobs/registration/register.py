@@ -92,8 +92,6 @@ from drake_pose.registration.standing_object import (
 from drake_pose.registration.track_registration import TrackRegistration
 from drake_pose.workers import use_workers
 
-OnCamera = Callable[[int], None]  # Called with the number of cameras that are done.
-
 
 @dataclass(frozen=True, eq=False)
 class SceneRegistration:
@@ -126,7 +124,7 @@ def register_scene(
     *,
     cameras: Path | str | None = None,
     overlay: bool = True,
-    on_camera: OnCamera = lambda _: None,
+    on_camera: Callable[[int], None] = lambda _: None,
 ) -> SceneRegistration:
     """Estimate the poses of a scene's or an episode's cameras, without an initial guess.
 
@@ -141,7 +139,7 @@ def register_scene(
         settings: what is registered, and how.
         cameras: a camera file in place of the scene's or episode's own.
         overlay: whether overlays are drawn.
-        on_camera: called after each camera.
+        on_camera: called after each camera, with the number of cameras that are done.
 
     Raises:
         RegistrationError: no pose of any camera explains its masks or pictures. Nothing is written
@@ -228,7 +226,10 @@ class _Registration:
     """
 
     def __init__(
-        self, inputs: RegistrationInputs, settings: RegistrationSettings, on_camera: OnCamera
+        self,
+        inputs: RegistrationInputs,
+        settings: RegistrationSettings,
+        on_camera: Callable[[int], None],
     ) -> None:
         self.inputs, self._settings, self._on_camera = inputs, settings, on_camera
         self.body = RegistrationBody(

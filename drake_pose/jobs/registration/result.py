@@ -266,12 +266,10 @@ def write_comparisons(
         write_file(folder, f"{AS_GIVEN}/{given.name}/{frame.name}.png", encode_png(picture))
 
 
-def write_corrections(
-    folder: Path, inputs: RegistrationInputs, found: Diagnosis, most: int = 8
-) -> None:
+def write_corrections(folder: Path, inputs: RegistrationInputs, found: Diagnosis) -> None:
     """Draw the robot as given and as found by an audit, if joints were corrected.
 
-    At most ``most`` frames are drawn into the folder AS_GIVEN, the largest errors first.
+    At most eight frames are drawn into the folder AS_GIVEN, the largest errors first.
     """
     names, count = TreeKinematics(inputs.tree).names, 0
     draw = body_drawer(inputs.tree, inputs.visible_nodes)
@@ -282,7 +280,7 @@ def write_corrections(
         values = seen.values
         for finding in (*found.common, *own):
             values = corrected(values, names, finding)
-        if np.array_equal(values, seen.values) or count == most:
+        if np.array_equal(values, seen.values) or count == 8:
             continue
         count += 1
         for camera in (one for one in inputs.known_cameras if one.name in seen.masks):

@@ -40,13 +40,11 @@ from drake_pose.registration.track_registration import (
 )
 
 
-def watch_cameras(inputs: RegistrationInputs, often: float = 0.5) -> RegistrationInputs:
+def watch_cameras(inputs: RegistrationInputs) -> RegistrationInputs:
     """Return an episode's inputs with its cameras' motions, and warnings of drift and shake.
 
     A camera whose background moves with one link of the robot, and is not given on another, is
     added to `links`. A scene of masks is returned as it is.
-
-    often: where a larger fraction of a picture's corners is found again, the camera stands still.
 
     Raises RegistrationError: as ``carrying_links``.
     """
@@ -59,7 +57,8 @@ def watch_cameras(inputs: RegistrationInputs, often: float = 0.5) -> Registratio
         motion = find_camera_motion(recording.read, len(recording.names), camera)
         motions[name] = motion
         carrying = tuple[str, ...]()
-        if motion.found_again < often:
+        # Where more of a picture's corners is found again, the camera stands still.
+        if motion.found_again < 0.5:
             body = RegistrationBody(inputs.tree, inputs.visible_nodes)
             with suppress(RegistrationError):
                 carrying = carrying_links(body, camera, recording)
@@ -98,9 +97,8 @@ def _say_riding(inputs: RegistrationInputs, name: str, carrying: Sequence[str]) 
 
     name: of the camera. carrying: names of the links that may carry it; (): any that moves may.
     """
-    kinematics = TreeKinematics(inputs.tree)
     moving = [one.name for one in inputs.tree.nodes[1:] if one.parent >= 0]
-    named = carrying or moving or kinematics.names
+    named = carrying or moving
     why = (
         "its pictures do not tell them apart"
         if carrying

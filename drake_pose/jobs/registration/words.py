@@ -230,7 +230,6 @@ def odd_link_warnings(
     *,
     max_ratio: float = 0.75,
     min_fraction: float = 0.04,
-    min_elsewhere: float = 0.5,
 ) -> list[str]:
     """Return a warning of each link whose contour hardly fits while those of other links do.
 
@@ -241,8 +240,6 @@ def odd_link_warnings(
             masks by Drake's renderer links as modelled have 0.93 or more, a link with another
             gripper 0.61 at most, with a box of its own size 0.64 at most.
         min_fraction: minimum length of a judged link's contour [length of all contours].
-        min_elsewhere: minimum fitting fraction of the other links' contours. Where these do not fit
-            either, as with masks that are too wide everywhere, no link is odd.
     """
     lengths, fitting = fit.matched_lengths(fit.start).T
     ratios = fitting / np.maximum(lengths, 1e-9)
@@ -252,7 +249,7 @@ def odd_link_warnings(
         return []
     others = shown & ~is_odd
     ratio = float(fitting[others].sum() / lengths[others].sum())
-    if ratio < min_elsewhere:
+    if ratio < 0.5:  # As with masks that are too wide everywhere.
         return []
     elsewhere = percent(ratio)
     texts, model = [], body.tree.model

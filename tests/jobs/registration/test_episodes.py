@@ -2,7 +2,6 @@
 
 import csv
 import json
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +12,7 @@ import pytest
 from drake_pose.camera.camera_files import load_cameras, save_cameras
 from drake_pose.errors import DrakePoseError
 from drake_pose.files.overlay import EXCESS_RGB, MISSING_RGB
-from drake_pose.files.settings import EstimateSettings, RegistrationSettings
-from drake_pose.jobs.estimate.inputs import read_inputs as read_estimate_inputs
+from drake_pose.files.settings import RegistrationSettings
 from drake_pose.jobs.registration.inputs import RegistrationInputs, read_inputs
 from drake_pose.jobs.registration.register import register_scene
 from drake_pose.silhouette.pictures.scenes import load_scene
@@ -48,20 +46,6 @@ def run(command: str, episode, out: Path, *more: object) -> dict[str, Any]:
     result = run_command([str(word) for word in words])
     assert result.exit_code == 0, result.output
     return json.loads((out / "summary.json").read_text())
-
-
-def test_starts_of_a_sequence_come_from_its_joint_log(episode, tmp_path):
-    scene, painted = episode
-    for name in ("images", "cameras.yaml", "joint_angles.csv"):
-        (tmp_path / name).symlink_to(scene / name)
-    read_estimate = partial(read_estimate_inputs, model_path=painted.path, truth_path=None)
-    plain = read_estimate(scene, settings=EstimateSettings())
-    (tmp_path / "scene.yaml").write_text("sequence: true")
-    found = read_estimate(tmp_path, settings=EstimateSettings())
-    assert found.frames == plain.frames
-    assert found.starts.keys() == plain.starts.keys()
-    for frame, start in plain.starts.items():
-        np.testing.assert_array_equal(found.starts[frame], start)
 
 
 @pytest.mark.parametrize("command", ["estimate", "register", "audit", "capture"])
@@ -113,10 +97,19 @@ def test_unknown_focal_length_is_assumed(episode, tmp_path):
 
 
 def test_given_poses_of_cameras_are_known(episode, tmp_path):
-    scene, _ = episode
+    """Also on a link that stands still, as its joints are held."""
+    scene, painted = episode
     file = edit_camera(scene / "cameras.yaml", "camera", tmp_path / "cameras.yaml", X_WC=None)
     for own, expected in ((None, {"camera"}), (scene / "cameras.yaml", {"camera"}), (file, set())):
         assert {one.name for one in read(*episode, None, own).given_cameras} == expected
+    edit_camera(file, "camera", link="box1", X_LC=painted.camera.X_WC.tolist())
+    assert read(*episode, None, file).links == {"camera": "box1"}
+    found = read(*episode, None, file, hold={"joint0": 30.0, "joint1": 20.0})
+    assert not found.links
+    plant = painted.model.plant
+    plant.SetPositions(context := plant.CreateDefaultContext(), np.radians([30, 20, 0, 0, 0]))
+    X_WL = plant.GetBodyByName("box1").EvalPoseInWorld(context).GetAsMatrix4()
+    np.testing.assert_allclose(found.given_cameras[0].X_WC, X_WL @ painted.camera.X_WC)
 
 
 @pytest.mark.parametrize(

@@ -105,6 +105,12 @@ def test_the_joint_map_and_meta_are_read_with_the_data_set(recorded, tmp_path):
     np.testing.assert_allclose(camera.kernel_parameters(), painted.camera.kernel_parameters())
     audited = read_inputs(tmp_path, painted.path, None, None, AuditSettings())
     assert [one.name for one in audited.given_cameras] == ["camera"]
+    # A link without a pose is no given pose.
+    info = json.loads(files["lerobot/meta/info.json"])
+    info["features"][KEY]["info"] |= {"camera_link": "box3", "camera_extrinsics": None}
+    (tmp_path / "meta" / "info.json").write_text(json.dumps(info))
+    riding = read_inputs(tmp_path, painted.path, None, None, AuditSettings())
+    assert (riding.links, riding.given_on_links) == ({"camera": "box3"}, ())
     assert before == {one: one.read_bytes() for one in folder.rglob("*") if one.is_file()}
 
 

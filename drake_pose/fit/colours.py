@@ -28,12 +28,7 @@ from drake_pose.camera.models import Camera
 from drake_pose.compiled import compiled, default_arguments
 from drake_pose.errors import SettingsError
 from drake_pose.fit.contour_fit import Comparison, Noise, camera_weights, pack_cameras
-from drake_pose.fit.kernel import (
-    Sum,
-    accumulate_residuals,
-    add_residual,
-    robust_weight,
-)
+from drake_pose.fit.kernel import Sum, accumulate_residuals, add_residual, robust_weight
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.parameters import Placement
 from drake_pose.silhouette.contour_points import sample_contour

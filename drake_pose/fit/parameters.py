@@ -342,10 +342,7 @@ def scale_surfaces(packed: PackedOutlines, scale: Array) -> PackedOutlines:
 def _rotation(r: Array) -> tuple[Array, Array]:
     """Return the rotation (3, 3) of a rotation vector (3,) [rad], and the left Jacobian (3, 3)."""
     angle = float(np.linalg.norm(r))
-    if angle > 1e-4:
-        a, b = np.sin(angle) / angle, (1.0 - np.cos(angle)) / angle**2
-        c = (1.0 - a) / angle**2
-    else:
-        a, b, c = 1.0 - angle**2 / 6.0, 0.5 - angle**2 / 24.0, 1.0 / 6.0 - angle**2 / 120.0
+    a, b = np.sinc(angle / np.pi), 0.5 * np.sinc(0.5 * angle / np.pi) ** 2
+    c = (1.0 - a) / max(angle**2, 1e-18)  # Where rounding counts, K is small.
     K = np.array([[0.0, -r[2], r[1]], [r[2], 0.0, -r[0]], [-r[1], r[0], 0.0]])
     return np.eye(3) + a * K + b * K @ K, np.eye(3) + b * K + c * K @ K

@@ -250,9 +250,7 @@ def _sample_surface(outline: Outline, count: int = 300) -> Array:
 
 
 def load_or_make(
-    made_of: tuple[bytes, ...],
-    make: Callable[[], Outline],
-    most_files: int = 500,
+    made_of: tuple[bytes, ...], make: Callable[[], Outline], most_files: int = 500
 ) -> Outline:
     """Return a surface from its file, or make and store it.
 

@@ -1,4 +1,4 @@
-"""Edge points, matches, weights, and fits of one pose."""
+"""Matches, weights, and fits of one pose."""
 
 from dataclasses import replace
 
@@ -9,14 +9,16 @@ from drake_pose.camera.models import ParallelCamera, circle_of_cameras
 from drake_pose.fit.contour_fit import (
     ContourFit,
     Noise,
+    PoseFit,
     Prior,
     camera_weights,
+    compare_views,
     pack_cameras,
     pack_views,
     pixels_per_metre,
 )
-from drake_pose.fit.evidence import find_edge_points
-from drake_pose.fit.kernel import assemble_normal_equations, match_points
+from drake_pose.fit.evidence import NO_EDGE, find_edge_points
+from drake_pose.fit.kernel import Sum, assemble_normal_equations, match_points
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 
@@ -39,50 +41,6 @@ def standing_pose(person, **degrees):
     for name, angle in degrees.items():
         q[person.position_index(name)] = np.radians(angle)
     return q
-
-
-class TestEdges:
-    @pytest.fixture
-    def ring(self):
-        v, u = np.mgrid[:240, :320]
-        distance = np.hypot(u - 150.3, v - 110.7)
-        return (distance < 80.0) & (distance > 40.0)
-
-    def test_points_lie_on_the_circles_and_normals_point_outwards(self, ring):
-        edge = find_edge_points(ring, 4.0)
-        off = edge.uv - [150.3, 110.7]
-        radius = np.linalg.norm(off, axis=1)
-        outer = radius > 60.0
-        np.testing.assert_allclose(radius[outer], 80.0, atol=1.0)
-        np.testing.assert_allclose(radius[~outer], 40.0, atol=1.0)
-        along = (off / radius[:, None] * edge.normals).sum(axis=1)
-        assert along[outer].min() > 0.9
-        assert along[~outer].max() < -0.9
-        assert edge.lengths[outer].sum() == pytest.approx(2 * np.pi * 80.0, rel=0.03)
-        assert edge.lengths[~outer].sum() == pytest.approx(2 * np.pi * 40.0, rel=0.03)
-        assert (np.diff(edge.uv[:, 1]) >= 0.0).all()
-
-    def test_image_border_is_not_an_edge(self):
-        mask = np.zeros((60, 80), dtype=bool)
-        mask[20:, 30:50] = True
-        edge = find_edge_points(mask, 2.0)
-        assert edge.uv[:, 1].max() < 59.0
-
-    def test_an_empty_mask_has_no_edge(self):
-        edge = find_edge_points(np.zeros((60, 80), dtype=bool), 2.0)
-        assert len(edge.uv) == 0
-        assert np.isnan(edge.middle).all()
-
-    @pytest.mark.parametrize("degrees", [0.0, 10.0, 26.0, 45.0, 63.0, 80.0])
-    def test_points_are_on_the_edge_on_average(self, degrees):
-        # A half plane, rasterised by pixel centres, with many offsets of its edge.
-        n = np.array([np.cos(np.radians(degrees)), np.sin(np.radians(degrees))])
-        v, u = np.mgrid[:200, :200]
-        off = []
-        for offset in np.linspace(0.0, 1.0, 21)[:-1] + 140.0:
-            edge = find_edge_points(n[0] * u + n[1] * v < offset, 1.0)
-            off.append((edge.uv @ n - offset).mean())
-        assert abs(np.mean(off)) < 0.03
 
 
 def test_matched_points_against_brute_force():
@@ -150,51 +108,65 @@ def test_pixels_per_metre_match_projections():
         assert np.diff(camera.project(ends)[0][:, 0])[0] / 2e-3 == pytest.approx(size, rel=1e-6)
 
 
-class TestFit:
-    @pytest.mark.parametrize("count", [4, 9])
-    def test_pose_is_recovered_from_drakes_masks(self, person, fit, count):
-        true = standing_pose(
-            person,
-            left_upper_arm_z=50,
-            left_forearm_x=-60,
-            right_upper_arm_x=-70,
-            right_forearm_x=-30,
-            left_thigh_x=-40,
-            left_shin_x=50,
-            neck_base_x=20,
-        )
-        cameras = list(circle_of_cameras(count, size=(320, 240), face_camera=False).values())
-        edges = [
-            find_edge_points(LabelRenderer(person, camera).mask(true), 4.0) for camera in cameras
-        ]
-        order = [person.position_index(name) for name in fit.kinematics.names]
-        start = true[order] + np.random.default_rng(1).normal(0.0, 0.08, len(order))
-        prior = Prior(start, np.full(len(start), 1.0 / 0.3**2))
-        found = fit.fit(pack_views(cameras, edges), start, (*STEPS, *STEPS), prior)
-        off = fit.kinematics.poses(found.values) - fit.kinematics.poses(true[order])
-        assert 1e3 * np.linalg.norm(off[:, :3, 3], axis=1).max() < 12.0
-        assert found.inlier_ratio > 0.9
-        assert (found.values >= fit.lower).all()
-        assert (found.values <= fit.upper).all()
+def test_scores_are_fractions_of_both_contours():
+    sums = np.random.default_rng(1).uniform(size=(3, 6))
+    found = PoseFit(np.zeros(1), sums, 0.0, 1)
+    total = sums.sum(axis=0)
+    assert found.inlier_ratio == pytest.approx(total[Sum.FITTING] / total[Sum.COMPARED])
+    assert found.closeness == pytest.approx(total[Sum.CLOSE] / total[Sum.COMPARED])
+    nothing = PoseFit(np.zeros(1), 0.0 * sums, 0.0, 1)
+    assert nothing.inlier_ratio == nothing.closeness == 0.0
 
-    def test_fixed_values_and_unobserved_values_stay(self, person, fit):
-        camera = circle_of_cameras(1, size=(160, 120), face_camera=False)["camera_0"]
-        start = np.zeros(len(fit.lower))
-        empty = find_edge_points(np.zeros((120, 160), dtype=bool), 4.0)
-        found = fit.fit(pack_views([camera], [empty]), start, STEPS)
-        np.testing.assert_allclose(found.values, start, atol=1e-9)
-        assert (found.inlier_ratio, found.evaluations) == (0.0, len(STEPS))
-        # A prior pulls, within the limits.
-        prior = Prior(start + 0.03, np.full(len(start), 100.0))
-        found = fit.fit(pack_views([camera], [empty]), start, 4 * STEPS, prior)
-        np.testing.assert_allclose(
-            found.values, np.clip(start + 0.03, fit.lower, fit.upper), atol=2e-3
-        )
-        edge = find_edge_points(LabelRenderer(person, camera).mask(standing_pose(person)), 4.0)
-        order = [person.position_index(name) for name in fit.kinematics.names]
-        start = standing_pose(person)[order] + 0.05
-        held = np.arange(len(start)) % 2 == 0
-        found = fit.fit(pack_views([camera], [edge]), start, STEPS, None, held)
-        clipped = np.clip(start, fit.lower, fit.upper)
-        np.testing.assert_array_equal(found.values[held], start[held])
-        assert np.abs(found.values - clipped)[~held].max() > 1e-3
+
+def test_pose_is_recovered_from_drakes_masks(person, fit):
+    true = standing_pose(
+        person, left_upper_arm_z=50, left_forearm_x=-60, right_upper_arm_x=-70,
+        right_forearm_x=-30, left_thigh_x=-40, left_shin_x=50, neck_base_x=20,
+    )  # fmt: skip
+    cameras = list(circle_of_cameras(4, size=(320, 240), face_camera=False).values())
+    edges = [find_edge_points(LabelRenderer(person, camera).mask(true), 4.0) for camera in cameras]
+    order = [person.position_index(name) for name in fit.kinematics.names]
+    start = true[order] + np.random.default_rng(1).normal(0.0, 0.08, len(order))
+    prior, views = Prior(start, np.full(len(start), 1.0 / 0.3**2)), pack_views(cameras, edges)
+    found = fit.fit(views, start, (*STEPS, *STEPS), prior)
+    off = fit.kinematics.poses(found.values) - fit.kinematics.poses(true[order])
+    assert 1e3 * np.linalg.norm(off[:, :3, 3], axis=1).max() < 12.0
+    assert found.inlier_ratio > 0.9
+    assert (found.values >= fit.lower).all()
+    assert (found.values <= fit.upper).all()
+
+    def compare(placement, stage):
+        return compare_views(views, placement, fit.weights(views.cameras, placement, stage))
+
+    again = fit.fit(compare, start, (*STEPS, *STEPS), prior)
+    np.testing.assert_array_equal(again.values, found.values)
+    # Costs in tiles of the image add up to the cost.
+    tiles = fit.tile_costs(views, found.values, STEPS[-1], 20.0)
+    sums = fit.compare(views, found.values, STEPS[-1]).sums
+    np.testing.assert_allclose(tiles.sum(axis=(1, 2)), sums[:, :, Sum.COST].sum(axis=1))
+    assert (tiles[:, 12:] == 0.0).all()
+    assert (tiles[:, :, 16:] == 0.0).all()
+    assert 5 < np.count_nonzero(tiles[0]) < 100
+
+
+def test_fixed_values_and_unobserved_values_stay(person, fit):
+    camera = circle_of_cameras(1, size=(160, 120), face_camera=False)["camera_0"]
+    start, nothing = np.zeros(len(fit.lower)), pack_views([camera], [NO_EDGE])
+    found = fit.fit(nothing, start, STEPS)
+    np.testing.assert_allclose(found.values, start, atol=1e-9)
+    assert (found.inlier_ratio, found.evaluations) == (0.0, len(STEPS))
+    # A prior pulls, within the limits.
+    prior = Prior(start + 0.03, np.full(len(start), 100.0))
+    found = fit.fit(nothing, start, [AnnealingStage(0.1, 0.1, 20)], prior)
+    expected = np.clip(start + 0.03, fit.lower, fit.upper)
+    np.testing.assert_allclose(found.values, expected, atol=2e-3)
+    cost = 100.0 * ((found.values - prior.mean) ** 2).sum()
+    assert found.cost == pytest.approx(cost)
+    edge = find_edge_points(LabelRenderer(person, camera).mask(standing_pose(person)), 4.0)
+    order = [person.position_index(name) for name in fit.kinematics.names]
+    start = standing_pose(person)[order] + 0.05
+    held = np.arange(len(start)) % 2 == 0
+    found = fit.fit(pack_views([camera], [edge]), start, STEPS, None, held)
+    clipped = np.clip(start, fit.lower, fit.upper)
+    np.testing.assert_array_equal(found.values[held], start[held])
+    assert np.abs(found.values - clipped)[~held].max() > 1e-3

@@ -26,10 +26,8 @@ from drake_pose.fit.covariance import (
     vuong_statistic,
     without_rotations,
 )
-from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.parameters import affine_motions
 from drake_pose.fit.surfaces import simplify_surfaces
-from drake_pose.search import ViewsFit
 from drake_pose.silhouette.outline import (
     EMPTY_OUTLINE,
     Outline,
@@ -37,10 +35,8 @@ from drake_pose.silhouette.outline import (
     outline_from_mesh,
     outline_of_triangles,
 )
-from tests.search.arms import arm_tree, damaged_views, draw_pose
+from tests.search.arms import arm_tree
 
-FINE = tuple(AnnealingStage(scale, 0.0125, 8) for scale in (0.025, 0.0125))
-STEP = AnnealingStage(0.025, 0.0125)
 ANGLES = np.ones(3, dtype=bool)
 ALL = np.arange(3)
 # The information of uniform priors over a full turn.
@@ -171,42 +167,6 @@ def test_deformations_move_surfaces_by_a_metre(kinematics):
 @pytest.fixture(scope="module")
 def kinematics(tmp_path_factory):
     return TreeKinematics(arm_tree(tmp_path_factory.mktemp("arm")))
-
-
-def fitted(kinematics, views, truth):
-    """Return the error of a pose fitted from the truth, its standard deviations, and the sizes."""
-    fit = ViewsFit(kinematics, simplify_surfaces(TreeSurfaces(kinematics.tree)), views)
-    values = fit.refine(truth, FINE).values
-    residuals = fit.distances(values, STEP)
-    sizes = estimate_sizes(residuals, kinematics.is_angle)
-    free = np.arange(len(truth))
-    covariance = values_covariance(residuals, sizes, free, kinematics.is_angle)
-    return values - truth, np.sqrt(np.diag(covariance)), sizes
-
-
-def test_intervals_cover_the_truth_despite_errors_of_cameras_masks_and_links(kinematics):
-    """Intervals that assume independent errors would be far too narrow."""
-    errors, deviations = [], []
-    generator = np.random.default_rng(7)
-    for seed in range(12):
-        truth = 0.8 * draw_pose(kinematics.tree, generator)
-        error, deviation, _ = fitted(kinematics, damaged_views(kinematics.tree, truth, seed), truth)
-        errors.append(error)
-        deviations.append(deviation)
-    ratios = np.abs(errors) / np.array(deviations)
-    assert np.mean(ratios < 1.96) >= 0.95
-    assert np.median(ratios) > 0.2
-
-
-def test_tile_costs_add_up_to_the_cost(kinematics):
-    truth = np.array([0.6, 0.7, -0.7, 0.9, 0.3])
-    views = damaged_views(kinematics.tree, truth, 2)
-    fit = ViewsFit(kinematics, simplify_surfaces(TreeSurfaces(kinematics.tree)), views)
-    tiles = fit.tile_costs(truth, STEP)
-    assert tiles.sum() == pytest.approx(fit.cost(truth, STEP))
-    # Only tiles with an edge of the silhouette or the body have a cost.
-    assert 5 < np.count_nonzero(tiles[0]) < 80
-    assert (tiles >= 0.0).all()
 
 
 def test_nuisances_are_removed_by_their_posterior_mean():

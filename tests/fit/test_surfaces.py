@@ -17,6 +17,7 @@ from drake_pose.fit.surfaces import (
     simplify_rigid_parts,
     simplify_surfaces,
     surface_distance,
+    with_radius_scales,
 )
 from drake_pose.silhouette.outline import TreeSurfaces, outline_from_mesh
 from drake_pose.workers import map_ordered
@@ -78,27 +79,41 @@ def test_a_thin_rod_is_kept():
 
 
 def test_surface_distance_matches_brute_force():
-    generator = np.random.default_rng(7)
+    """Tiny triangles at thirty places, against triangles of very different sizes."""
+    rng = np.random.default_rng(7)
+    places = rng.uniform(-1.0, 1.0, (30, 3))
+    tiny = (places[:, None] + 1e-6 * rng.normal(size=(30, 3, 3))).reshape(-1, 3)
+    sizes = np.repeat([0.5, 0.05, 0.005], 12)[:, None, None]
+    corners = rng.uniform(-1.0, 1.0, (36, 1, 3)) + 0.6 + sizes * rng.normal(size=(36, 3, 3))
     one, other = (
-        outline_from_mesh(
-            TriangleMesh(center + generator.uniform(-1, 1, (30, 3)), np.arange(30).reshape(-1, 3))
-        )
-        for center in (0.0, 0.7)
+        outline_from_mesh(TriangleMesh(points, np.arange(len(points)).reshape(-1, 3)))
+        for points in (tiny, corners.reshape(-1, 3))
     )
-    there = nearest_sample(on_surface(one, 1000), other)
-    back = nearest_sample(on_surface(other, 1000), one)
+    there = np.min([
+        np.linalg.norm(trimesh.triangles.closest_point(np.tile(k, (30, 1, 1)), places) - places,
+                       axis=1) for k in corners
+    ], axis=0)  # fmt: skip
+    back = np.linalg.norm(on_surface(other)[:, None] - places, axis=2).min(axis=1)
     expected = np.sqrt(0.5 * ((there**2).mean() + (back**2).mean()))
-    np.testing.assert_allclose(surface_distance(one, other), expected, rtol=0.1)
+    np.testing.assert_allclose(surface_distance(one, other), expected, rtol=0.03)
     empty = outline_from_mesh(TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), np.int32)))
-    assert surface_distance(one, empty) == np.inf
-    assert surface_distance(one, one) == pytest.approx(0.0, abs=1e-9)
+    assert surface_distance(one, empty) == surface_distance(empty, one) == np.inf
+    assert surface_distance(other, other) == pytest.approx(0.0, abs=1e-9)
 
 
 def test_simplification_is_thread_safe():
-    balls = [outline_from_mesh(ball(5, 0.1 + 0.01 * k)) for k in range(12)]
+    balls = [outline_from_mesh(ball(4, 0.1 + 0.01 * k)) for k in range(6)]
     together = map_ordered(lambda one: collapse_edges(one, FEW), balls, 4)
     for given, one in zip(balls, together, strict=True):
         np.testing.assert_array_equal(collapse_edges(given, FEW).vertices, one.vertices)
+
+
+def test_radius_scales_widen_across_the_y_axis():
+    given = [outline_from_mesh(ball(1, 0.1)), outline_from_mesh(ball(0, 0.2))]
+    for one, factor, wide in zip(given, (2.0, 1.0), with_radius_scales(given, [2.0, 1.0]),
+                                 strict=True):  # fmt: skip
+        np.testing.assert_allclose(wide.vertices, one.vertices * [factor, 1.0, factor])
+        np.testing.assert_array_equal(wide.triangles, one.triangles)
 
 
 @pytest.fixture

@@ -516,19 +516,10 @@ def run_walk_through(
             advance(k + 1)
     commands, poses, _ = walk_by(model, motion.q)
     found_commands, found_poses, rests = walk_by(model, q)
-    seconds = {}
-    for name, true_frames in active_frames(commands).items():
-        captured = active_frames(found_commands)[name]
-        counts = {
-            "true": true_frames.sum(),
-            "captured": captured.sum(),
-            "wrongly": captured[~true_frames].sum(),
-        }
-        seconds[name] = {f"{key}_s": PERIOD * float(number) for key, number in counts.items()}
     error = found_poses[-1] - poses[-1]
     figures = {
         "same_command": float((commands == found_commands).all(axis=1).mean()),
-        "commands": seconds,
+        "commands": command_seconds(commands, found_commands),
         "place_error_m": float(np.linalg.norm(error[:2])),
         "heading_error_deg": abs(math.degrees(math.remainder(error[2], 2.0 * math.pi))),
         "frames": len(names), "cameras": cameras, "seed": seed, "method": "paper",
@@ -539,6 +530,20 @@ def run_walk_through(
         for name, k in middles.items()
     }
     return figures, pictures
+
+
+def command_seconds(commands: Array, found: Array) -> dict[str, dict[str, float]]:
+    """Return by name of COMMANDS the seconds in which it was active: truly, as found, and wrongly.
+
+    ``commands``, ``found``: (n, 2) true commands and found ones, as of `recognise_command`.
+    """
+    pairs = zip(active_frames(commands).items(), active_frames(found).values(), strict=True)
+    frames = {name: (true, captured, captured & ~true) for (name, true), captured in pairs}
+    keys = "true_s", "captured_s", "wrongly_s"
+    return {
+        name: {key: PERIOD * np.count_nonzero(own) for key, own in zip(keys, three, strict=True)}
+        for name, three in frames.items()
+    }
 
 
 def active_frames(commands: Array) -> dict[str, Mask]:

@@ -141,7 +141,7 @@ def run_experiment(
         return follow(hand_filter, make_sequence(r_13, seen, observation, generator))
 
     # The first call loads compiled code, which must not count as an update's time.
-    filtered(0, 35.0)
+    filtered(0, min(CASES.values()))
     advance = count(f"sequences, {settings.truncation} truncation", runs * len(CASES))
     trials = {}
     for place, (key, r_13) in enumerate(CASES.items()):

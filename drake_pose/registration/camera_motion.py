@@ -107,7 +107,7 @@ def find_camera_motion(
         return PictureMotion(())
     rows = np.linspace(0, count - 1, min(count, MOTION.most)).round().astype(int)
     rows = np.unique([*range(3), *rows.tolist(), *range(count - 3, count)])
-    tracker = _Background(read, int(rows[len(rows) // 2]), camera)
+    tracker = BackgroundTracker(read, int(rows[len(rows) // 2]), camera)
     shifts, again = np.split(tracker.shifts(rows.tolist()), [4], axis=1)
     found_again, known = float(np.median(again)), np.isfinite(shifts).all(axis=1)
     # Where the background is often hidden or lost, nothing is known of the camera's motion.
@@ -192,7 +192,7 @@ def _bracket(
 
     def bisect(reference: int, low: int, high: int, from_low: bool) -> tuple[int, int]:
         """Bracket the end of the pictures near a reference, which is low or high."""
-        tracker = _Background(read, reference, camera)
+        tracker = BackgroundTracker(read, reference, camera)
         while high - low > 1:
             k = (low + high) // 2
             is_near = float(np.linalg.norm(tracker.shifts([k])[:, :4])) < near
@@ -203,7 +203,7 @@ def _bracket(
     return low, bisect(high, low, high, from_low=False)[1] if top < high else high
 
 
-class _Background:
+class BackgroundTracker:
     """Measures the shift of the background between a reference picture and others.
 
     Attributes:

@@ -52,7 +52,7 @@ class DiagnosisSettings(NamedTuple):
 DIAGNOSIS = DiagnosisSettings()
 
 
-class _Information(NamedTuple):
+class Information(NamedTuple):
     """The information of frames about x: the quadratic form x^T N x - 2 h^T x.
 
     N: (p, p) and h: (p,). of_surface: (p, 12 nodes) derivative of h by surface errors, which are
@@ -69,7 +69,7 @@ class _Information(NamedTuple):
     scale: float
     freedom: float
 
-    def plus(self, info: "_Information", sign: float = 1.0) -> "_Information":
+    def plus(self, info: "Information", sign: float = 1.0) -> "Information":
         """Return the sum with `info` divided by its variance factor; sign -1: the difference."""
         weight = sign / info.scale
         return self._replace(
@@ -81,7 +81,7 @@ class _Information(NamedTuple):
             freedom=self.freedom + sign * info.freedom,
         )
 
-    def part(self, rows: Mask) -> "_Information":
+    def part(self, rows: Mask) -> "Information":
         """Return the information about the errors in `rows` (p,) if the others are known."""
         both = np.ix_(rows, rows)
         N, outlines = self.N[both], self.outlines[:, rows][:, :, rows]
@@ -94,7 +94,7 @@ class _Information(NamedTuple):
         return float(np.sqrt(squares[moved].sum() / max(self.lengths[moved].sum(), 1e-9)))
 
 
-class _Cause(NamedTuple):
+class Cause(NamedTuple):
     """A possible cause of errors, and the result of its test.
 
     kind: "joint", "length", "camera", "base", "focal" or "center"; name: of the joint, link or
@@ -119,10 +119,10 @@ class _Cause(NamedTuple):
     gain: float = 0.0
 
 
-class _Residual(NamedTuple):
+class Residual(NamedTuple):
     """Residual r (p,) of N x = r, with N (p, p), r's covariance Q (p, p), and frames' info."""
 
-    info: _Information
+    info: Information
     N: Array
     r: Array
     Q: Array
@@ -139,15 +139,15 @@ class _Residual(NamedTuple):
     @property
     def p_value(self) -> float:
         """Probability of a residual at least as large if nothing is wrong."""
-        return _p_value(*_statistic(self.r, self.Q, self.N), self.info.freedom)
+        return f_test(*weighted_square(self.r, self.Q, self.N), self.info.freedom)
 
-    def test(self, cause: _Cause) -> _Cause:
+    def test(self, cause: Cause) -> Cause:
         """Return a cause with estimated amount, covariance and x, and with its p_value and gain."""
         M = cause.jacobian
-        T, rank = _statistic(M.T @ self.r, M.T @ self.Q @ M, M.T @ self.N @ M)
+        T, rank = weighted_square(M.T @ self.r, M.T @ self.Q @ M, M.T @ self.N @ M)
         # The number of parameters penalises causes that have several.
         p_value, gain = (
-            _p_value(T, rank, self.info.freedom),
+            f_test(T, rank, self.info.freedom),
             self.explained(M)[0] - 2.0 * M.shape[1],
         )
         return self.together([cause._replace(p_value=p_value, gain=gain)])[0]
@@ -162,15 +162,15 @@ class _Residual(NamedTuple):
         along = U[:, singular > 1e-6 * singular.max(initial=1e-6)].T @ A[:, -1]
         return float(along @ along), len(along)
 
-    def is_explained_by(self, one: _Cause, other: _Cause) -> bool:
+    def is_explained_by(self, one: Cause, other: Cause) -> bool:
         """Return whether another cause is not significant beside a cause."""
         both, alone = (
             self.explained(M) for M in (np.hstack([one.jacobian, other.jacobian]), one.jacobian)
         )
         more = both[0] - alone[0], both[1] - alone[1]
-        return _p_value(*more, self.info.freedom) > DIAGNOSIS.significance
+        return f_test(*more, self.info.freedom) > DIAGNOSIS.significance
 
-    def together(self, causes: Sequence[_Cause], cameras: Sequence[_Cause] = ()) -> list[_Cause]:
+    def together(self, causes: Sequence[Cause], cameras: Sequence[Cause] = ()) -> list[Cause]:
         """Return the causes, estimated together and beside small errors of the cameras' poses.
 
         cameras: causes with a prior: errors along each direction move outlines by
@@ -194,7 +194,7 @@ class _Residual(NamedTuple):
             for one, k in zip(causes, rows, strict=True)
         ]
 
-    def sufficient(self, tests: Sequence[_Cause], fraction: float = 0.25) -> list[_Cause]:
+    def sufficient(self, tests: Sequence[Cause], fraction: float = 0.25) -> list[Cause]:
         """Return the tested causes that explain the residual by themselves, see `_best_first`.
 
         They leave less than a fraction of the residual's pixels, or less than ``min_pixels``.
@@ -202,18 +202,15 @@ class _Residual(NamedTuple):
         most = max(DIAGNOSIS.min_pixels, fraction * self.pixels())
         return _best_first(one for one in tests if self.pixels(one.x) < most)
 
-    def without(self, cause: _Cause) -> "_Residual":
+    def without(self, cause: Cause) -> "Residual":
         """Return the residual after elimination of a cause's parameters, whatever their amount."""
         M, N = cause.jacobian, self.N
         gain = np.eye(len(N)) - N @ M @ np.linalg.pinv(M.T @ N @ M) @ M.T
-        return _Residual(self.info, gain @ N @ gain.T, gain @ self.r, gain @ self.Q @ gain.T)
+        return Residual(self.info, gain @ N @ gain.T, gain @ self.r, gain @ self.Q @ gain.T)
 
 
 def diagnose_frames(
-    fit: PerFrameFit,
-    frames: Sequence[FrameFit],
-    at: Array | None = None,
-    moved: bool = False,
+    fit: PerFrameFit, frames: Sequence[FrameFit], at: Array | None = None, moved: bool = False
 ) -> Diagnosis:
     """Diagnose fitted frames, in time linear in their number.
 
@@ -228,11 +225,7 @@ class _Diagnoser:
     """State of a diagnosis."""
 
     def __init__(
-        self,
-        fit: PerFrameFit,
-        frames: Sequence[FrameFit],
-        at: Array,
-        moved: bool,
+        self, fit: PerFrameFit, frames: Sequence[FrameFit], at: Array, moved: bool
     ) -> None:
         self._fit, self._frames, self._at, self._moved = fit, frames, at, moved
         # Tolerated errors of a single frame: standard deviations [rad, m].
@@ -242,7 +235,7 @@ class _Diagnoser:
         # Reported motions are clipped at a picture's diagonal: the linear model has no limit.
         self._max_pixels = max(float(np.hypot(one.width, one.height)) for one in fit.cameras)
         p, nodes = len(fit.names), len(fit.outlines)
-        self._empty = _Information(
+        self._empty = Information(
             np.zeros((p, p)), np.zeros(p), np.zeros((p, 12 * nodes)), np.zeros((nodes, p, p)),
             np.zeros(nodes), 1.0, 0.0,
         )  # fmt: skip
@@ -309,7 +302,7 @@ class _Diagnoser:
             sizes.append(estimate_sizes(distances, is_angle, min_camera=0.0)[:5])
         return ErrorSizes(*np.median(np.array(sizes), axis=0).tolist())
 
-    def _info_of(self, fitted: FrameFit, sizes: ErrorSizes, bias_sd: float = 2.0) -> _Information:
+    def _info_of(self, fitted: FrameFit, sizes: ErrorSizes, bias_sd: float = 2.0) -> Information:
         """Return a frame's information; bias_sd: prior deviation of its masks' biases [pixel]."""
         known = float(SHARED.prior_freedom)
         if not fitted.compared_masks:
@@ -324,7 +317,7 @@ class _Diagnoser:
         V = distances_covariance(distances, sizes) + bias_sd**2 * biases @ biases.T
         PX, Py = np.split(np.linalg.solve(V, np.column_stack([X, distances.y])), [-1], axis=1)
         N, h = X.T @ PX, PX.T @ distances.y
-        T, rank = _statistic(h, N)
+        T, rank = weighted_square(h, N)
         residual = max(float(distances.y @ Py[:, 0]) - T, 0.0)
         freedom = known + len(distances.y) - rank
         scale = max((known + residual) / freedom, 1.0)
@@ -332,34 +325,34 @@ class _Diagnoser:
         for one in fitted.compared_masks:
             moves = one.moves * self._fit.deviations[:, None]
             outlines += moves @ one.A @ np.swapaxes(moves, 1, 2)
-        return _Information(
+        return Information(
             N, h, PX.T @ distances.surface_derivatives, outlines, fitted.outline_lengths, scale,
             freedom,
         )  # fmt: skip
 
-    def _sum(self, kept: Mask) -> _Information:
+    def _sum(self, kept: Mask) -> Information:
         """Return the sum of the information of the `kept` (frames,) ones."""
-        return reduce(_Information.plus, compress(self._info, kept), self._empty)
+        return reduce(Information.plus, compress(self._info, kept), self._empty)
 
-    def _covariance(self, total: _Information) -> Array:
+    def _covariance(self, total: Information) -> Array:
         """Return the covariance (p, p) of a sum's h, with errors of the surfaces."""
         surface = self._surface * total.of_surface
         return np.asarray(total.N + surface @ surface.T)
 
-    def _common(self, total: _Information) -> tuple[Array, Array]:
+    def _common(self, total: Information) -> tuple[Array, Array]:
         """Return the errors x (p,) common to the frames of a sum, and their covariance (p, p)."""
         # Without frames, the given values are right to within the tolerance.
         prior = np.eye(len(total.h)) if total.freedom else np.linalg.inv(self._tolerance)
         inverse, left = np.linalg.inv(total.N + prior), total.h - total.N @ self._at
         return self._at + inverse @ left, inverse @ (self._covariance(total) + prior) @ inverse
 
-    def _residual(self, info: _Information, x: Array, covariance: Array) -> _Residual:
+    def _residual(self, info: Information, x: Array, covariance: Array) -> Residual:
         """Return a frame's residual from the common errors x (p,), with their covariance (p, p)."""
         Q = info.scale * info.N + info.N @ (covariance + self._tolerance) @ info.N
         rows, part = self._fit.posed, info.part(self._fit.posed)
-        return _Residual(part, part.N, (info.h - info.N @ x)[rows], Q[np.ix_(rows, rows)])
+        return Residual(part, part.N, (info.h - info.N @ x)[rows], Q[np.ix_(rows, rows)])
 
-    def _causes(self, fitted: FrameFit | None) -> list[_Cause]:
+    def _causes(self, fitted: FrameFit | None) -> list[Cause]:
         """Return the possible causes, untested, of errors in one fitted frame, or in all (None).
 
         A frame's cameras are those with a mask. In all frames focal lengths and principal points
@@ -367,16 +360,16 @@ class _Diagnoser:
         """
         fit, names, six = self._fit, self._fit.camera_names, len(POSE_NAMES)
 
-        def cause(kind: str, name: str, rows: Sequence[int], rank: float) -> _Cause:
+        def cause(kind: str, name: str, rows: Sequence[int], rank: float) -> Cause:
             """Return a cause with one parameter for each of some rows."""
-            return _Cause(kind, name, np.eye(len(fit.names))[:, rows], fit.deviations[rows], rank)
+            return Cause(kind, name, np.eye(len(fit.names))[:, rows], fit.deviations[rows], rank)
 
         causes = [cause("joint", name, [k], 1.0) for k, name in enumerate(fit.joints)]
         for c, name in enumerate(names):
             if fitted is None or c in {one.camera for one in fitted.compared_masks}:
                 causes.append(cause("camera", name, fit.rows(POSE_NAMES, [name]), six))
         if len(names) > 1:
-            causes.append(_Cause("base", "base", fit.base_jacobian(), np.ones(six), six))
+            causes.append(Cause("base", "base", fit.base_jacobian(), np.ones(six), six))
         if fitted is not None:
             return [one._replace(jacobian=one.jacobian[fit.posed]) for one in causes]
         if self._moved:
@@ -400,7 +393,7 @@ class _Diagnoser:
                 causes.append(single[0]._replace(jacobian=jacobian))
         return causes
 
-    def _finding(self, sufficient: Sequence[_Cause], pixels: float) -> Finding:
+    def _finding(self, sufficient: Sequence[Cause], pixels: float) -> Finding:
         """Return the finding of the first sufficient cause; the others are its alternatives.
 
         pixels: root mean square distance by which the cause moves outlines [pixel].
@@ -434,7 +427,7 @@ class _Diagnoser:
         off = (*sizes, min(pixels, self._max_pixels), best.p_value, tuple(alternatives))
         return Finding(kind, name, *off, at_body=at_body)
 
-    def _joints_finding(self, kind: str, residual: _Residual) -> Finding:
+    def _joints_finding(self, kind: str, residual: Residual) -> Finding:
         """Return a finding, "joints" or "unexplained", of a frame that no single cause explains."""
         x, names = residual.solved(residual.r), self._fit.joints
         sd = np.sqrt(residual.info.scale * np.diag(np.linalg.inv(residual.N + np.eye(len(x)))))
@@ -456,7 +449,7 @@ class _Diagnoser:
         info = self._sum(kept)
         Q = self._covariance(info) + info.N @ self._tolerance @ info.N / np.count_nonzero(kept)
         h = info.h - info.N @ self._at * self._moved
-        residual = _Residual(info, info.N, h, Q)
+        residual = Residual(info, info.N, h, Q)
         causes = self._causes(None)
         if self._moved:
             # The base is a cause only if its motion explains nearly all by itself.
@@ -474,12 +467,12 @@ class _Diagnoser:
                 center = x.tolist(), np.sqrt(np.diag(covariance)).tolist()
         # The linear equations err by a part of the step from where the frames were fitted.
         slack = 0.25 * residual.pixels(self._at)
-        whole, (residual, found, left) = residual, _name(residual, causes, slack)
+        whole, (residual, found, left) = residual, name_causes(residual, causes, slack)
         # Small offsets and lengths are tested after elimination of all cameras' poses.
         for cause in (one for one in causes if one.kind == "camera"):
             residual = residual.without(cause)
         small = [one for one in left if one.kind in ("joint", "length")]
-        residual, offsets, undetected = _name(residual, small, slack)
+        residual, offsets, undetected = name_causes(residual, small, slack)
         found += offsets
         findings, at = list[Finding](), np.zeros(len(info.h))
         if found:
@@ -489,17 +482,17 @@ class _Diagnoser:
                 pixels = info.pixels(better.x)
                 # A cause may vanish in the joint estimate.
                 T = float(better.amount @ np.linalg.solve(better.covariance, better.amount))
-                p_value = _p_value(T, len(better.amount), info.freedom)
+                p_value = f_test(T, len(better.amount), info.freedom)
                 if p_value <= LEVEL and pixels >= DIAGNOSIS.min_common_pixels:
                     findings.append(self._finding([better, *others_too], pixels))
                     at += better.x
         undetected = [one for one in undetected if one.kind == "joint"]
-        return tuple(findings), center, _minimum_detectable(residual, undetected), at
+        return tuple(findings), center, minimum_detectable_offsets(residual, undetected), at
 
 
-def _name(
-    residual: _Residual, causes: Sequence[_Cause], slack: float = 0.0
-) -> tuple[_Residual, list[list[_Cause]], list[_Cause]]:
+def name_causes(
+    residual: Residual, causes: Sequence[Cause], slack: float = 0.0
+) -> tuple[Residual, list[list[Cause]], list[Cause]]:
     """Select significant causes, of untested ones, one after another.
 
     Of those that explain as much as the best, so that it is not significant beside them, the one
@@ -509,7 +502,7 @@ def _name(
     residual without the selected causes; for each a list of it and its alternatives; and the
     causes that are left.
     """
-    left, named = list(causes), list[list[_Cause]]()
+    left, named = list(causes), list[list[Cause]]()
     while left:
         # A cause must be significant by itself (Bonferroni), and so must its alternatives.
         tests = [
@@ -533,12 +526,12 @@ def _name(
     return residual, named, left
 
 
-def _best_first(causes: Iterable[_Cause]) -> list[_Cause]:
+def _best_first(causes: Iterable[Cause]) -> list[Cause]:
     """Return causes, the lowest rank first, among equal ranks that with the largest gain."""
     return sorted(causes, key=lambda one: (one.rank, -one.gain))
 
 
-def _minimum_detectable(residual: _Residual, causes: Sequence[_Cause]) -> dict[str, float]:
+def minimum_detectable_offsets(residual: Residual, causes: Sequence[Cause]) -> dict[str, float]:
     """Return by joint the offset detected with a probability of 95 % [rad or m]; inf: never.
 
     causes: of kind "joint", without a finding in the residual.
@@ -567,7 +560,7 @@ def is_half_pixel(offset: Array, covariance: Array, near: float = 0.25) -> bool:
     return chdtrc(2, T) <= DIAGNOSIS.significance and bool(np.abs(offset - half).max() <= near)
 
 
-def _statistic(r: Array, Q: Array, N: Array | None = None) -> tuple[float, int]:
+def weighted_square(r: Array, Q: Array, N: Array | None = None) -> tuple[float, int]:
     """Return r^T Q^-1 r in the directions with enough information, and their number.
 
     r (p,) has the covariance Q (p, p) and the information N (p, p); None: Q is both.
@@ -580,6 +573,6 @@ def _statistic(r: Array, Q: Array, N: Array | None = None) -> tuple[float, int]:
     return float(along @ np.linalg.solve(turn.T @ Q @ turn, along)), turn.shape[1]
 
 
-def _p_value(T: float, rank: int, freedom: float) -> float:
-    """Return the p-value of T, see `_statistic`: T / rank has an F distribution; rank 0: 1."""
+def f_test(T: float, rank: int, freedom: float) -> float:
+    """Return the p-value of T, see `weighted_square`: T / rank has an F distribution; rank 0: 1."""
     return float(fdtrc(rank, freedom, max(T, 0.0) / rank)) if rank else 1.0

@@ -392,13 +392,7 @@ def _twists(problem: TrackProblem, X_LC: Array, constants: Array) -> Array:
 
 
 def _without_points(
-    seen: Sightings,
-    r: Array,
-    A: Array,
-    B: Array,
-    w: Array,
-    count: int,
-    damping: float = 1e-6,
+    seen: Sightings, r: Array, A: Array, B: Array, w: Array, count: int, damping: float = 1e-6
 ) -> tuple[Array, Array, Callable[[Array], Array]]:
     """Return the normal equations of cameras and focal length, without points (Schur complement).
 

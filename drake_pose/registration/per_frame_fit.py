@@ -113,12 +113,12 @@ class PerFrameFit:
         poses = np.tile(np.arange(len(CAMERA_NAMES)) < len(POSE_NAMES), len(cameras))
         self.posed = np.concatenate([joints >= 0, poses, lengths < 0.0])
         error = SHARED.point_error * np.sqrt(SHARED.error_length)
-        self._middle = middle_of(kinematics, frames)
-        self._simplified, self._full = (
+        self.middle = middle_of(kinematics, frames)
+        self.problem, self._full = (
             Problem(
                 BodyParameters(kinematics, one, offsets=offsets), cameras,
                 [Unknowns([*compress(self.names, own)], deviation=self.deviations[own] / error)],
-                pivot=self._middle, pixels=self.size,
+                pivot=self.middle, pixels=self.size,
                 steps=StepSettings(max_step=0.2, damping=1e-3, uniform_damping=1e-6),
             )
             for one, own in zip(outlines, (self.posed, self.posed | True), strict=True)
@@ -152,7 +152,7 @@ class PerFrameFit:
         rounds, start = [AnnealingStage(scale, 0.02) for scale in scales], (own, nothing)
         # Corrections that were found before are near.
         for part in (rounds[-3 if change.any() else 0 :], rounds[-2:]):
-            found = self._simplified.solve([base], part, (own, nothing), expected=start)
+            found = self.problem.solve([base], part, (own, nothing), expected=start)
             own = found.own
             theta = self.with_boundary_biases(base, found.parameters[0])
             base = given._replace(values=np.append(held[:-count], theta[-count:]))
@@ -199,7 +199,7 @@ class PerFrameFit:
         for k, beside in ((1, None), (2, None), (3, None), (0, 1), (4, 3)):
             if beside is None or (np.argmin(costs, axis=0) == beside).any():
                 found[-count:] = biases[k]
-                compared, _ = self._simplified.compare(observation, found, SHARED.inlier_stage)
+                compared, _ = self.problem.compare(observation, found, SHARED.inlier_stage)
                 costs[k] = compared.sums[:, :, Sum.COST].sum(axis=1)
         best = np.clip(np.argmin(costs, axis=0), 1, len(biases) - 2)
         low, middle, high = (np.choose(best + k, costs) for k in (-1, 0, 1))
@@ -220,7 +220,7 @@ class PerFrameFit:
         change = (at * self.deviations)[first : first + kinds * len(self.cameras)]
         if not change.any():
             return self.cameras
-        X_CW, kernel, _ = CameraParameters(self.cameras, self._middle).place(change)
+        X_CW, kernel, _ = CameraParameters(self.cameras, self.middle).place(change)
         placed = list[Camera]()
         for one, X, (_, *lens) in zip(self.cameras, X_CW, kernel.tolist(), strict=True):
             moved = one.with_pose(np.linalg.inv(X))
@@ -252,7 +252,7 @@ class PerFrameFit:
         POSE_NAMES turn and shift the body about its middle, in the camera's frame.
         """
         X_CW = self.cameras[self.camera_names.index(camera)].X_CW
-        middle = X_CW[:3, :3] @ self._middle + X_CW[:3, 3]
+        middle = X_CW[:3, :3] @ self.middle + X_CW[:3, 3]
         return np.hstack([np.cross(np.eye(3), middle).T, -np.eye(3)])
 
 

@@ -472,9 +472,7 @@ def base_rotation(
 
 
 def offsets_in_pictures(
-    body: RegistrationBody,
-    found: Mapping[str, PictureRegistration],
-    offset_joints: Sequence[str],
+    body: RegistrationBody, found: Mapping[str, PictureRegistration], offset_joints: Sequence[str]
 ) -> tuple[dict[str, float], dict[str, tuple[float, float]], dict[str, PinholeCamera]]:
     """Return joint offsets of registrations in pictures, all cameras together.
 

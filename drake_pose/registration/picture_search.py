@@ -164,10 +164,7 @@ class PictureSearch:
     """
 
     def __init__(
-        self,
-        body: RegistrationBody,
-        camera: PinholeCamera,
-        frames: Sequence[PosedPicture],
+        self, body: RegistrationBody, camera: PinholeCamera, frames: Sequence[PosedPicture]
     ) -> None:
         self._body, self.camera, self.frames = body, camera, tuple(frames)
         coarse, *finer = (simplify_or_hull(body.coarse, count) for count in PICTURES.triangles)

@@ -270,9 +270,9 @@ class PyramidLevel:
         # A node is static if its points move by less than 0.06 of the body's size.
         self._static = most < 0.06 * size
         moving = points[:, ~self._static[owners]]
-        self._points = (moving if moving.size else points).reshape(-1, 3)
-        self._middle = self._points.mean(axis=0)
-        off = self._points - self._middle
+        self.points = (moving if moving.size else points).reshape(-1, 3)
+        self.middle = self.points.mean(axis=0)
+        off = self.points - self.middle
         self._size = float(np.sqrt((off**2).sum(axis=1).mean()))
 
     def with_camera(self, camera: PinholeCamera) -> "PyramidLevel":
@@ -335,7 +335,7 @@ class PyramidLevel:
         outline = 0.3 * len(X_WN) * self.camera.width
         return ScoredPictures(
             self._packed, X_WN, self._static, self._parameters, self.backgrounds.sums,
-            self._middle, np.array([max(possible, 1e-9), outline, PICTURES.contour_weight]),
+            self.middle, np.array([max(possible, 1e-9), outline, PICTURES.contour_weight]),
         )  # fmt: skip
 
     def best(self, X_CW: Sequence[Array], frames: int, fraction: float) -> list[Array]:
@@ -364,7 +364,7 @@ class PyramidLevel:
         squares = (u - middle[0]) ** 2 + (v - middle[1]) ** 2
         spread = max(float(np.sqrt((changes * squares).sum() / total)), 2.0)
         R_CW = np.concatenate([uniform_rotations(rotations), upright_rotations(rotations)])
-        points = self._points[:: max(1, len(self._points) // 200)] - self._middle
+        points = self.points[:: max(1, len(self.points) // 200)] - self.middle
         p_C = np.einsum("nij,pj->npi", R_CW, points)
         sizes = np.sqrt((p_C[..., :2] ** 2).sum(axis=2).mean(axis=1))
         nearest = 0.05 * self._size - 0.7 * p_C[..., 2].min(axis=1)
@@ -378,7 +378,7 @@ class PyramidLevel:
                 X[:, :3, :3] = R_CW
                 directions = (middle + spread * aside - centre) / focal
                 p_CM = np.column_stack([directions, np.ones(len(R_CW))]) * depth[:, None]
-                X[:, :3, 3] = p_CM - R_CW @ self._middle
+                X[:, :3, 3] = p_CM - R_CW @ self.middle
                 starts += list(X)
         return starts
 
@@ -412,15 +412,15 @@ class PyramidLevel:
 
     def opposite(self, X_CW: Array) -> Array:
         """Return X_CW (4, 4) of an opposite camera, as far away, which sees mirror images."""
-        return opposite_side(X_CW, self._middle)
+        return opposite_side(X_CW, self.middle)
 
     def depth_twin(self, X_CW: Array) -> Array:
         """Return X_CW (4, 4) reversed in depth, see ``judge.depth_twin``."""
-        return depth_twin(X_CW, self._points)
+        return depth_twin(X_CW, self.points)
 
     def distinct(self, X_CW: Sequence[Array], most: int | None = None) -> list[Array]:
         """Return at most `most` poses (4, 4), those unlike all earlier ones; None: no maximum."""
-        points = self._points[:: max(1, len(self._points) // 50)]
+        points = self.points[:: max(1, len(self.points) // 50)]
         kept, places = list[Array](), np.zeros((0, *points.shape))
         for X in X_CW:
             p_C = points @ X[:3, :3].T + X[:3, 3]
@@ -435,7 +435,7 @@ class PyramidLevel:
     def moved(self, X_CW: Array, x: Array) -> Array:
         """Return a pose (4, 4) moved by x (6,) in the camera's frame, see ``move_pose``."""
         moved = X_CW.copy()
-        move_pose(X_CW[:3], self._middle, x, moved[:3])
+        move_pose(X_CW[:3], self.middle, x, moved[:3])
         return moved
 
 

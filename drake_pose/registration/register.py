@@ -31,11 +31,7 @@ from drake_pose.fit.covariance import vuong_statistic
 from drake_pose.fit.judge import LEVEL, PairedEvidence, depth_twin, opposite_side, paired_evidence
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.surfaces import FEW, VERY_FEW, simplify_surfaces, with_radius_scales
-from drake_pose.registration.posed_frames import (
-    LAST_SPACING,
-    PosedFrame,
-    PosedFrames,
-)
+from drake_pose.registration.posed_frames import LAST_SPACING, PosedFrame, PosedFrames
 from drake_pose.registration.shared_fit import SharedFit, SharedValues, fit_pose
 from drake_pose.silhouette.outline import EMPTY_OUTLINE, Outline, TreeSurfaces
 from drake_pose.silhouette.scoring import score_bodies

@@ -312,7 +312,7 @@ class SharedFit:
         parameters and errors of the cameras' intrinsics, and from nuisance parameters that no
         residual shows, such as the first joint's offset without a base.
         """
-        distances = self._distances_with_nuisances(found, SHARED.final_stage, included)
+        distances = self.distances_with_nuisances(found, SHARED.final_stage, included)
         is_angle = np.zeros(distances.X.shape[1], bool)
         sizes = estimate_sizes(distances, is_angle, 0.0, SHARED.prior_deviation)
         nuisance, unseen, distances = nuisance_covariance(distances, sizes, is_angle)
@@ -322,7 +322,7 @@ class SharedFit:
         # Wrong intrinsics are the same in all frames, and the pose absorbs them without residuals.
         # So a calibration is trusted to a pixel at best where surfaces are seen to err. Repeated
         # noise of a static part may be an error of its surface: none of it counts as noise here.
-        distances = self._distances_with_nuisances(found, SHARED.inlier_stage, included)
+        distances = self.distances_with_nuisances(found, SHARED.inlier_stage, included)
         distances = distances._replace(effects=distances.effects[[0, 0, 2, 3, 4]])
         sizes = estimate_sizes(
             distances, np.zeros(distances.X.shape[1], bool), 0.0, SHARED.prior_deviation
@@ -354,7 +354,7 @@ class SharedFit:
 
         Returns value and standard deviation by joint [rad or m], highest score first; {}: none.
         """
-        distances = self._distances_with_nuisances(found, SHARED.inlier_stage, included)
+        distances = self.distances_with_nuisances(found, SHARED.inlier_stage, included)
         angles = np.zeros(distances.X.shape[1], bool)
         sizes = estimate_sizes(distances, angles, 0.0, SHARED.prior_deviation)
         values, deviations = score_nuisances(distances, sizes)
@@ -455,7 +455,7 @@ class SharedFit:
         masks = self.problem.compared_masks(observations, self._parameters(at)[included], step)
         return distances_in_masks(self.problem.body.outlines, masks, with_bias=True)
 
-    def _distances_with_nuisances(
+    def distances_with_nuisances(
         self, found: SharedValues, step: AnnealingStage, included: Mask | None
     ) -> Distances:
         """Return `distances`, with derivatives by up to three groups of nuisance parameters.

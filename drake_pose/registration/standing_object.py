@@ -312,20 +312,20 @@ class TargetSearch:
             (SEARCH.fine, SEARCH.fine_spacing, "medium"),
             (SHARED.stages_with_constants, LAST_SPACING, "full"),
         ):
-            fits = [self._fit(camera, frames, pose, spacing, surfaces) for pose in poses]
+            fits = [self.fit_from(camera, frames, pose, spacing, surfaces) for pose in poses]
             fitted = [
-                self._fitted(fit, fit.fit(rounds), pose)
+                self.fitted(fit, fit.fit(rounds), pose)
                 for fit, pose in zip(fits, poses, strict=True)
             ]
-            poses = self._distinct(fitted, frames)
+            poses = self.distinct(fitted, frames)
         last = []
         for k, pose in enumerate(poses):
-            fit = self._fit(camera, frames, pose)
+            fit = self.fit_from(camera, frames, pose)
             now = fit_to_inliers(fit)
             # Restart there, so that the shared unknowns are 0 and covariances refer to the result.
-            poses[k] = self._fitted(fit, now, pose)
+            poses[k] = self.fitted(fit, now, pose)
             at = now._replace(shared=0.0 * now.shared)
-            last.append((self._fit(camera, frames, poses[k]), at))
+            last.append((self.fit_from(camera, frames, poses[k]), at))
         found, covariance, as_good = select_best(last)
         X_LC, X_WT = poses[as_good[0]]
         others = [X_WT @ turn for turn in distinct_motions(*self._target.symmetry)[1:]]
@@ -362,7 +362,7 @@ class TargetSearch:
         """
         poses = self._starts(camera, self._single_poses(camera, choices, explained))[0]
         seen = [own for own in choices if own]
-        off = [self._misfits(camera, [own], poses[None], SEARCH.refined_side)[0] for own in seen]
+        off = [self.misfits(camera, [own], poses[None], SEARCH.refined_side)[0] for own in seen]
         return poses, int(np.count_nonzero(np.array(off) < explained))
 
     def _single_poses(
@@ -405,11 +405,7 @@ class TargetSearch:
         return found
 
     def _starts(
-        self,
-        camera: PinholeCamera,
-        single: Sequence[SinglePoses],
-        starts: int = 12,
-        kept: int = 4,
+        self, camera: PinholeCamera, single: Sequence[SinglePoses], starts: int = 12, kept: int = 4
     ) -> list[HandEye]:
         """Return up to `kept` hypotheses of both poses, best first; `starts` of them are fitted.
 
@@ -428,24 +424,24 @@ class TargetSearch:
                 "the joint positions those of these frames, and does the camera ride on this link? "
                 "Nothing was written"
             )
-        misfits = self._misfits(camera, likely_masks, hypotheses, SEARCH.start_side)
+        misfits = self.misfits(camera, likely_masks, hypotheses, SEARCH.start_side)
         order = np.argsort(misfits, kind="stable")
         fitted = []
-        for pose in self._distinct(hypotheses[order[: 10 * starts]], some)[:starts]:
+        for pose in self.distinct(hypotheses[order[: 10 * starts]], some)[:starts]:
             # The mask of each frame that the hypothesis explains best.
             by = [
-                [self._misfits(camera, [[one]], pose[None])[0] for one in own]
+                [self.misfits(camera, [[one]], pose[None])[0] for one in own]
                 for own in likely_masks
             ]
             chosen = [own[int(np.argmin(each))] for own, each in zip(likely_masks, by, strict=True)]
-            fit = self._fit(camera, chosen, pose, SEARCH.coarse_spacing, "coarse")
-            fitted.append(self._fitted(fit, fit.fit(SEARCH.coarse), pose))
-        misfits = self._misfits(camera, likely_masks, np.array(fitted), SEARCH.refined_side)
+            fit = self.fit_from(camera, chosen, pose, SEARCH.coarse_spacing, "coarse")
+            fitted.append(self.fitted(fit, fit.fit(SEARCH.coarse), pose))
+        misfits = self.misfits(camera, likely_masks, np.array(fitted), SEARCH.refined_side)
         # Much worse hypotheses are dropped.
         limit = 0.02 + 2.0 * float(misfits.min())
         order = np.argsort(misfits, kind="stable")
         best = [fitted[k] for k in order if misfits[k] <= limit]
-        return self._distinct(best, some)[:kept]
+        return self.distinct(best, some)[:kept]
 
     def _gains(self, camera: PinholeCamera, single: Sequence[SinglePoses], pose: HandEye) -> Array:
         """Return the gains (n, n) of n pictures' best masks with the rows of all pictures."""
@@ -453,7 +449,7 @@ class TargetSearch:
         X_CT = np.concatenate([self.poses_in_camera(pose[None], row) for row in rows])
         return np.array([1.0 - self._misfit(camera, own[0], X_CT) for own, _ in single])
 
-    def _misfits(
+    def misfits(
         self,
         camera: PinholeCamera,
         choices: Sequence[Sequence[PosedFrame]],
@@ -472,11 +468,7 @@ class TargetSearch:
         return np.asarray(np.mean(off, axis=0))
 
     def _misfit(
-        self,
-        camera: PinholeCamera,
-        one: PosedFrame,
-        X_CT: Array,
-        side: float = SEARCH.refined_side,
+        self, camera: PinholeCamera, one: PosedFrame, X_CT: Array, side: float = SEARCH.refined_side
     ) -> Array:
         """Return E_total (n,) of the target at poses X_CT (n, 4, 4) in one mask, clipped at 1.
 
@@ -492,7 +484,7 @@ class TargetSearch:
         X_WL = self._target.link_poses(values[None])[0]
         return np.asarray(inverse_transforms(X_WL @ poses[:, 0]) @ poses[:, 1])
 
-    def _fit(
+    def fit_from(
         self,
         camera: PinholeCamera,
         frames: Sequence[PosedFrame],
@@ -508,12 +500,12 @@ class TargetSearch:
         posed = PosedFrames(body.kinematics, getattr(body, surfaces), camera, frames, spacing)
         return SharedFit([posed], [inverse_transforms(start[0])], TARGET_POSITIONS)
 
-    def _fitted(self, fit: SharedFit, found: SharedValues, start: HandEye) -> HandEye:
+    def fitted(self, fit: SharedFit, found: SharedValues, start: HandEye) -> HandEye:
         """Return both poses at the values that a fit found from a start."""
         moved = self._target.moved(start[1], found.shared[fit.per_camera :])
         return np.array([fit.cameras(found)[0].X_WC, moved])
 
-    def _distinct(
+    def distinct(
         self, poses: Sequence[HandEye] | Array, frames: Sequence[PosedFrame]
     ) -> list[HandEye]:
         """Return poses that show the target, in frames, unlike earlier ones, up to symmetries."""

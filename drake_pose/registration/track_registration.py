@@ -28,11 +28,7 @@ from drake_pose.registration.hand_eye import (
     rotation_spread,
 )
 from drake_pose.registration.joint_offsets import KinematicParameter
-from drake_pose.registration.picture_matches import (
-    Matches,
-    Sightings,
-    match_pictures,
-)
+from drake_pose.registration.picture_matches import Matches, Sightings, match_pictures
 from drake_pose.registration.recording import Recording, TimeOffset, choose_pictures
 from drake_pose.registration.register import FrameMisfit, RegisteredCamera, RegistrationBody
 from drake_pose.registration.shared_fit import SHARED
@@ -139,7 +135,7 @@ def register_tracks(
     problem = TrackProblem(camera, link_poses, seen, sds)
     _require_motion(camera, link, link_poses(np.zeros(1 + len(names))))
     _require_matches(camera, matches, len(rows))
-    poses, constants, explained, chance = _search(problem, matches, focal, timed)
+    poses, constants, explained, chance = search_pose(problem, matches, focal, timed)
     if explained < settings.least_gain * chance:
         search, values = EpipolarSearch(camera, matches), recording.values_at(0.0)[rows]
         others = explaining_links(body, base, values, search, settings.chance_rotations)
@@ -164,7 +160,7 @@ def register_tracks(
         found,
         clock,
         float(deviations[6]),
-        _describe_offsets(names, offset_joints, problem, fit, deviations),
+        describe_offsets(names, offset_joints, problem, fit, deviations),
         likely,
         explained,
         chance,
@@ -176,7 +172,7 @@ def register_tracks(
     )
 
 
-def _search(
+def search_pose(
     problem: TrackProblem, matches: Matches, focal: bool, timed: bool
 ) -> tuple[list[Array], Array, float, float]:
     """Search the pose, and where asked the focal length and the time offset, in all matches.
@@ -502,7 +498,7 @@ def _misfits(
     )
 
 
-def _describe_offsets(
+def describe_offsets(
     names: Sequence[str],
     asked: Sequence[str],
     problem: TrackProblem,

@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.registration.camera_motion import (
+    BackgroundTracker,
     PictureMotion,
-    _Background,
     find_camera_motion,
     find_steps,
 )
@@ -62,7 +62,7 @@ def turn(axis: tuple[float, float, float], pixels: float) -> np.ndarray:
     return Rotation.from_rotvec(vector * pixels / FOCAL).as_matrix()
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_nudges_are_found_at_their_picture_with_their_angle(seed: int) -> None:
     rng = np.random.default_rng([seed, 1])
     first, pixels = int(rng.integers(4, COUNT - 4)), float(rng.uniform(1.0, 13.0))
@@ -79,7 +79,7 @@ def test_nudges_are_found_at_their_picture_with_their_angle(seed: int) -> None:
     assert (motion.drift, motion.shake) == (0.0, 0.0)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", [0, 1])
 def test_a_camera_that_stands_still_has_no_motion(seed: int) -> None:
     motion = told(lambda _: STILL, 10 + seed, lamp=seed % 2 == 1)
     assert motion == PictureMotion((), found_again=motion.found_again)
@@ -159,7 +159,7 @@ def test_a_background_shift_has_four_parts_in_tracked_pixels() -> None:
         moved[:, 2] += u, v
         view = cv2.warpAffine(wall, moved, (1280, 960), borderMode=cv2.BORDER_REFLECT)
         views.append(view.clip(0, 255).astype(np.uint8))
-    tracker = _Background(lambda k: views[k], 0, camera)
+    tracker = BackgroundTracker(lambda k: views[k], 0, camera)
     assert tracker.scale == 0.5
     found = tracker.shifts(range(len(cases)))
     for shift, (u, v, angle, grow) in zip(found, cases, strict=True):
@@ -167,5 +167,5 @@ def test_a_background_shift_has_four_parts_in_tracked_pixels() -> None:
         np.testing.assert_allclose(shift[:4], expected, atol=0.12)
     turn_of = tracker.rotation(np.array([3.0, -2.0, 5.0, 9.0]))
     np.testing.assert_allclose(turn_of, [2.0 / 600.0, 3.0 / 600.0, 5.0 / radius])
-    blank = _Background(lambda _: np.full((960, 1280, 3), 90, np.uint8), 0, camera)
+    blank = BackgroundTracker(lambda _: np.full((960, 1280, 3), 90, np.uint8), 0, camera)
     assert np.isnan(blank.shifts([0])[:, :4]).all()

@@ -14,15 +14,15 @@ from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.registration.diagnosis import (
     DIAGNOSIS,
-    _Cause,
-    _Information,
-    _minimum_detectable,
-    _name,
-    _p_value,
-    _Residual,
-    _statistic,
+    Cause,
+    Information,
+    Residual,
     diagnose_frames,
+    f_test,
     is_half_pixel,
+    minimum_detectable_offsets,
+    name_causes,
+    weighted_square,
 )
 from drake_pose.registration.findings import Diagnosis, Finding
 from drake_pose.registration.per_frame_fit import (
@@ -215,7 +215,7 @@ class TestAuditFrames:
         assert found.common[0].shift == pytest.approx(5.0, abs=0.7)
 
 
-def information(scale: float = 1.0, freedom: float = 50.0, seed: int = 3) -> _Information:
+def information(scale: float = 1.0, freedom: float = 50.0, seed: int = 3) -> Information:
     """Return random information about five unknowns, the outlines of two nodes, and no surface."""
     rng = np.random.default_rng(seed)
     J = rng.normal(0.0, 3.0, (40, 5))
@@ -226,20 +226,20 @@ def information(scale: float = 1.0, freedom: float = 50.0, seed: int = 3) -> _In
         outlines[node] = half.T @ half
     N = J.T @ J
     lengths = np.array([100.0, 300.0])
-    return _Information(
+    return Information(
         N, N @ rng.normal(size=5), np.zeros((5, 24)), outlines, lengths, scale, freedom
     )
 
 
-def cause(name: str, *columns: int, rank: float = 1.0) -> _Cause:
-    return _Cause("joint", name, np.eye(5)[:, [*columns]], np.ones(len(columns)), rank)
+def cause(name: str, *columns: int, rank: float = 1.0) -> Cause:
+    return Cause("joint", name, np.eye(5)[:, [*columns]], np.ones(len(columns)), rank)
 
 
-def residual_of(x: np.ndarray, seed: int = 5) -> _Residual:
+def residual_of(x: np.ndarray, seed: int = 5) -> Residual:
     """Return a residual that errors x (5,) cause, beside noise with the covariance N."""
     info = information()
     noise = np.linalg.cholesky(info.N) @ np.random.default_rng(seed).normal(size=5)
-    return _Residual(info, info.N, info.N @ x + noise, info.N)
+    return Residual(info, info.N, info.N @ x + noise, info.N)
 
 
 def test_statistic_and_p_value_are_those_of_known_directions() -> None:
@@ -250,10 +250,10 @@ def test_statistic_and_p_value_are_those_of_known_directions() -> None:
     Q, r = 2.0 * N + np.eye(4), rng.normal(0.0, 5.0, 4)
     kept = turn[:, 1:]
     expected = (kept.T @ r) @ np.linalg.solve(kept.T @ Q @ kept, kept.T @ r)
-    assert _statistic(r, Q, N) == (pytest.approx(expected), 3)
-    assert _statistic(r, Q, 0.1 * np.eye(4)) == (0.0, 0)
-    assert _p_value(5.0, 0, 9.0) == 1.0
-    assert _p_value(-1e-9, 2, 9.0) == 1.0
+    assert weighted_square(r, Q, N) == (pytest.approx(expected), 3)
+    assert weighted_square(r, Q, 0.1 * np.eye(4)) == (0.0, 0)
+    assert f_test(5.0, 0, 9.0) == 1.0
+    assert f_test(-1e-9, 2, 9.0) == 1.0
 
 
 def test_causes_are_estimated_by_least_squares() -> None:
@@ -309,29 +309,29 @@ def test_sufficient_causes_leave_little_and_the_simplest_comes_first() -> None:
 def test_causes_are_named_one_after_another_while_significant() -> None:
     causes = [cause(name, k) for k, name in enumerate("abcde")]
     residual = residual_of(np.array([0.0, 3.0, 0.0, 1.0, 0.0]))
-    left, named, others = _name(residual, causes)
+    left, named, others = name_causes(residual, causes)
     assert [[one.name for one in some] for some in named] == [["b"], ["d"]]
     assert [one.name for one in others] == ["a", "c", "e"]
     expected = residual.without(causes[1]).without(causes[3])
     np.testing.assert_allclose(left.r, expected.r, atol=1e-9)
     # Causes that leave little explain as much; an insignificant one is not named.
-    assert [one.name for one in _name(residual, causes, np.inf)[1][0]][:2] == ["b", "d"]
-    assert _name(residual_of(np.zeros(5)), causes)[1] == []
+    assert [one.name for one in name_causes(residual, causes, np.inf)[1][0]][:2] == ["b", "d"]
+    assert name_causes(residual_of(np.zeros(5)), causes)[1] == []
     # Bonferroni's correction for their number: a p-value between a fifth of the level and it.
     alone = residual_of(np.zeros(5))
     for factor, count in ((0.5, 1), (0.1, 1), (0.5, 5), (0.1, 5)):
         N, r = np.diag(np.diag(alone.N)), np.zeros(5)
         r[0] = np.sqrt(chi2.isf(factor * DIAGNOSIS.significance, 1) * N[0, 0])
-        one = _Residual(alone.info._replace(freedom=1e9), N, r, N)
-        assert len(_name(one, causes[:count])[1]) == (factor * count <= 1.0)
+        one = Residual(alone.info._replace(freedom=1e9), N, r, N)
+        assert len(name_causes(one, causes[:count])[1]) == (factor * count <= 1.0)
 
 
 def test_minimum_detectable_offsets_are_detected_in_95_of_100_cases() -> None:
     """By Monte Carlo, with noise as large as the covariance says."""
     info = information()._replace(freedom=1e9, outlines=1e6 * information().outlines)
-    residual = _Residual(info, info.N, np.zeros(5), 3.0 * info.N)
+    residual = Residual(info, info.N, np.zeros(5), 3.0 * info.N)
     causes = [cause("a", 0)._replace(units=np.array([0.5])), cause("b", 3)]
-    found, rng = _minimum_detectable(residual, causes), np.random.default_rng(4)
+    found, rng = minimum_detectable_offsets(residual, causes), np.random.default_rng(4)
     half = np.linalg.cholesky(residual.Q)
     for one in causes:
         x = one.jacobian[:, 0] * found[one.name] / one.units[0]
@@ -343,8 +343,8 @@ def test_minimum_detectable_offsets_are_detected_in_95_of_100_cases() -> None:
         assert np.mean(hits) == pytest.approx(0.95, abs=0.02)
     # At least what moves outlines by the least motion; without information: never.
     slow = residual._replace(info=info._replace(outlines=1e-9 * info.outlines))
-    least = _minimum_detectable(slow, causes[1:])["b"]
+    least = minimum_detectable_offsets(slow, causes[1:])["b"]
     assert slow.info.pixels(least * np.eye(5)[3]) == pytest.approx(DIAGNOSIS.min_common_pixels)
     weak = residual._replace(N=1e-4 * info.N)
-    assert _minimum_detectable(weak, causes) == {"a": np.inf, "b": np.inf}
-    assert _minimum_detectable(residual, ()) == {}
+    assert minimum_detectable_offsets(weak, causes) == {"a": np.inf, "b": np.inf}
+    assert minimum_detectable_offsets(residual, ()) == {}

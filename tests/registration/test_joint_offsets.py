@@ -1,7 +1,6 @@
 """Calibration of joint offsets and link scales."""
 
 import re
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -63,31 +62,6 @@ class TestCalibrateJoints:
         shift, turn = errors(found.cameras[0].X_WC, camera.X_WC)
         assert shift < 3e-3
         assert turn < np.radians(0.15)
-
-    @pytest.mark.slow
-    def test_cameras_share_offsets_and_link_scales(self, model, body) -> None:
-        """Two cameras together estimate a robot's offset better than each alone."""
-        places = (np.array([1.6, 0.4, 0.5]), np.array([0.3, -1.6, 0.7]))
-        registered, frames, alone = [], [], []
-        for seed, place in enumerate(places):
-            camera = replace(looking_at(place, MIDDLE, 0.1), name=f"eye {seed}")
-            frames.append(misread(see(model, body, camera, 4, seed), ELBOW))
-            registered.append(CameraSearch(body).refine(camera, frames[-1]))
-            alone.append(calibrate_joints(body, registered[-1:], frames[-1:], ["elbow_turn"]))
-        found = calibrate_joints(
-            body, registered, frames, ["elbow_turn"], links=["shoulder", "elbow"]
-        )
-        (zero,) = found.offsets
-        assert zero.low < np.radians(2.0) < zero.high
-        assert zero.significant
-        assert zero.deviation < max(one.offsets[0].deviation for one in alone)
-        for one in found.link_scales:
-            assert one.low < 0.0 < one.high
-            assert not one.significant
-        for camera, place in zip(found.cameras, places, strict=True):
-            shift, turn = errors(camera.X_WC, looking_at(place, MIDDLE, 0.1).X_WC)
-            assert shift < 4e-3
-            assert turn < np.radians(0.15)
 
     @pytest.mark.parametrize("base", ["", '<cylinder radius="0.1" length="0.1"/>'])
     def test_an_unobservable_offset_widens_the_camera(self, tmp_path, camera, base: str) -> None:

@@ -114,7 +114,7 @@ def test_a_camera_that_may_turn_moves_on_an_arc() -> None:
 def test_errors_of_intrinsics_move_the_outline_alike_as_rotation_shift_and_depth(posed):
     """They are added to what nuisance parameters cause."""
     fit = SharedFit([posed], [posed.camera.X_CW])
-    distances = fit._distances_with_nuisances(fit.start, SHARED.final_stage, None)
+    distances = fit.distances_with_nuisances(fit.start, SHARED.final_stage, None)
     angles = np.zeros(distances.X.shape[1], bool)
     sizes = estimate_sizes(distances, angles, 0.0, SHARED.prior_deviation)
     without, _, _ = nuisance_covariance(distances, sizes, angles)
@@ -350,14 +350,14 @@ def test_hand_eye_fit_finds_camera_and_target(make_target):
     off[0] = X_LC @ motion(np.array([0.02, -0.02, 0.02, 0.01, -0.01, 0.01]))
     off[1] = thing.moved(true[1], np.array([0.01, 0.01, -0.01, 0.02, 0.02, -0.02]))
     wrong, right = (
-        search._misfits(camera, [[one]], np.array([true, off])) for one in (other, frames[0])
+        search.misfits(camera, [[one]], np.array([true, off])) for one in (other, frames[0])
     )
     assert right[0] < 0.05 < right[1] < wrong[0]
-    both = search._misfits(camera, [[other, frames[0]], [frames[1]]], true[None], 100.0)
+    both = search.misfits(camera, [[other, frames[0]], [frames[1]]], true[None], 100.0)
     assert both[0] < 0.05
-    fit = search._fit(camera, frames, off)
-    found = search._fitted(fit, fit.fit([STEP] * 12), off)
-    began, ended = search._misfits(camera, [[one] for one in frames], np.array([off, found]), 100.0)
+    fit = search.fit_from(camera, frames, off)
+    found = search.fitted(fit, fit.fit([STEP] * 12), off)
+    began, ended = search.misfits(camera, [[one] for one in frames], np.array([off, found]), 100.0)
     assert ended < 0.3 * began
     # Fewer than three frames with a likely mask are refused.
     quick = TargetSearch(thing, CameraSearch(thing.in_own_frame, rotations=20, fitted=2))
@@ -366,7 +366,7 @@ def test_hand_eye_fit_finds_camera_and_target(make_target):
     # Poses related by a symmetry of the target are the same, others are not.
     alike = np.array([true[0], true[1] @ thing.symmetry[0][1]])
     far = np.array([true[0], thing.moved(true[1], np.array([0.2, 0, 0, 0, 0, 0]))])
-    np.testing.assert_array_equal(search._distinct([true, alike, far], frames), [true, far])
+    np.testing.assert_array_equal(search.distinct([true, alike, far], frames), [true, far])
 
 
 NAMED = SimpleNamespace(
@@ -512,7 +512,7 @@ def test_boundary_bias_matches_dilation_and_erosion(per_frame, wider: int) -> No
         mask = (change(mask, disc) if by else mask).astype(bool)
         made = replace(frame, masks={"eye": mask})
         seen = Observation(made.edges(fit.cameras, fit.size / 100.0))
-        theta = np.zeros(len(parameter_names(fit._simplified.body, fit.cameras)))
+        theta = np.zeros(len(parameter_names(fit.problem.body, fit.cameras)))
         theta[: len(frame.values)] = frame.values
         widths.append(fit.with_boundary_biases(seen, theta)[-2])
     assert widths[1] - widths[0] == pytest.approx(wider, abs=0.35)
@@ -524,7 +524,7 @@ def test_corrections_of_the_base_and_of_lenses_match_projections(per_frame) -> N
     turn, shift, lens = np.array([0.2, -0.2, 0.2]), [0.02, 0.01, -0.03], [0.1, 3.0, -2.0]
     at, rows = fit.base_jacobian() @ [*turn, *shift], fit.rows(CAMERA_NAMES[6:], ["eye"])
     at[rows] = lens / fit.deviations[rows]
-    moved = (points - fit._middle) @ Rotation.from_rotvec(turn).as_matrix().T + fit._middle + shift
+    moved = (points - fit.middle) @ Rotation.from_rotvec(turn).as_matrix().T + fit.middle + shift
     for given, corrected in zip(fit.cameras, fit.cameras_at(at), strict=True):
         expected = given.project(moved)[0]
         if given.name == "eye":

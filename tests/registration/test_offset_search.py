@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from drake_pose.fit.base_edges import BASE, draw_normals, joint_rotation, locate_base
-from drake_pose.registration.picture_registration import register_pictures
 from drake_pose.registration.picture_search import PictureSearch, PosedPicture
 from drake_pose.registration.posed_frames import joints_like_cameras
 from tests.benchmarks.rooms import Room
@@ -41,27 +40,7 @@ def test_an_offset_about_a_fixed_axis_looks_like_a_rotation_of_the_camera(episod
     assert joints_like_cameras(kinematics, rests, shown) == ("joint0", "joint1")
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("names", [NAMES[1:], NAMES], ids=["others", "all"])
-def test_camera_and_large_offsets_are_found_within_their_deviations(episode, recording, names):
-    """All boxes move with the first joint: its offset is the same as a turn of the camera."""
-    nowhere = episode.camera.with_pose(np.eye(4))
-    wrong = recording(values_at=lambda by: episode.values_at(episode.times + by) - OFF)
-    one = register_pictures(episode.body, nowhere, wrong, offset_joints=names)
-    found = dict(zip(one.fit.fit.names, one.fit.found.shared, strict=True))
-    by = one.joint_offsets[0] + found.get("joint0", 0.0)
-    X_WW = joint_rotation(episode.body.kinematics, episode.values[0], 0, by)
-    shift, turn = errors(np.linalg.inv(one.found.camera.X_CW @ X_WW), episode.camera.X_WC)
-    assert shift < 0.02
-    assert turn < np.radians(1.0)
-    deviations = np.sqrt(np.diag(one.fit.covariance))
-    for k, name in enumerate(NAMES[1:], 1):
-        row = one.fit.fit.names.index(name)
-        value = one.joint_offsets[k] + found[name]
-        assert value == pytest.approx(OFF[k], abs=4.0 * deviations[row] + 1e-3)
-
-
-@pytest.mark.parametrize("degrees", [14.0, -14.0, 0.0])
+@pytest.mark.parametrize("degrees", [14.0, 0.0])
 def test_a_base_is_turned_to_its_edges(model, body, tmp_path, degrees: float) -> None:
     """The turret rests and stands for the base; all other boxes move with the shoulder."""
     camera = looking_at(np.array([1.2, 0.5, 0.9]), np.array([0.0, 0.0, 0.2]), 0.1)

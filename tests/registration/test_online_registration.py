@@ -121,108 +121,90 @@ def names(state: OnlineState) -> set[str]:
     return {one.name for one in state.keyframes}
 
 
-class TestKeyframes:
-    def test_the_camera_is_searched_with_enough_keyframes_and_the_newest_are_kept(
-        self, online, search
-    ):
-        frames = [frame("here", t) for t in TURNS]
-        state, statuses = follow(online, OnlineState(), frames[:3])
-        assert statuses == [NOT_REGISTERED] * 3
-        # A repeated pose of the body and an empty mask are no new information.
-        state, _ = follow(online, state, [frame("here", TURNS[1] + 0.01)] * 5)
-        empty = PosedFrame("empty", np.zeros(5), np.zeros((480, 640), dtype=bool))
-        assert online.next(state, empty) is state
-        assert (len(state.keyframes), search.searches) == (3, 0)
-        state, statuses = follow(online, state, frames[3:])
-        assert set(statuses) == {REGISTERED}
-        assert search.searches == 1
-        assert registered_at(state, 1.6)
-        assert state.keyframes == tuple(frames[2:])
-        assert len(state.registered.frames) == 6
-        assert copy.deepcopy(state) is state
+def test_a_camera_is_searched_with_enough_keyframes_and_the_newest_are_kept(online, search):
+    frames = [frame("here", t) for t in TURNS]
+    state, statuses = follow(online, OnlineState(), frames[:3])
+    assert statuses == [NOT_REGISTERED] * 3
+    # A repeated pose of the body and an empty mask are no new information.
+    state, _ = follow(online, state, [frame("here", TURNS[1] + 0.01)] * 5)
+    empty = PosedFrame("empty", np.zeros(5), np.zeros((480, 640), dtype=bool))
+    assert online.next(state, empty) is state
+    assert (len(state.keyframes), search.searches) == (3, 0)
+    state, statuses = follow(online, state, frames[3:])
+    assert (set(statuses), search.searches) == ({REGISTERED}, 1)
+    assert registered_at(state, 1.6)
+    assert state.keyframes == tuple(frames[2:])
+    assert len(state.registered.frames) == 6
+    assert copy.deepcopy(state) is state
 
-    @pytest.mark.parametrize(
-        ("doubt", "value"), [("alternatives", 1), ("p_value", 0.02), ("mirrored", 0.5)]
-    )
-    def test_an_ambiguous_or_unproven_camera_is_not_registered(self, online, search, doubt, value):
-        usual = getattr(search, doubt)
-        setattr(search, doubt, value)
-        state, statuses = follow(online, OnlineState(), [frame("here", t) for t in TURNS[:5]])
-        assert statuses[-1] == NOT_REGISTERED
-        setattr(search, doubt, usual)
-        _, statuses = follow(online, state, [frame("here", TURNS[5])])
-        assert statuses == [REGISTERED]
 
-    def test_unexplained_frames_do_not_register_a_camera_and_are_not_kept(self, online) -> None:
-        state, statuses = follow(online, OnlineState(), [frame("nowhere", t) for t in TURNS])
-        assert set(statuses) == {NOT_REGISTERED}
-        # The number of keyframes stays bounded.
-        assert len(state.keyframes) == 6
-        frames = [frame("here", t) for t in TURNS[:4]]
-        frames.insert(1, frame("nowhere", TURNS[5]))
-        state, statuses = follow(online, OnlineState(), frames)
-        assert statuses[-1] == REGISTERED
-        assert names(state) == {"here"}
+@pytest.mark.parametrize(
+    ("doubt", "value"), [("alternatives", 1), ("p_value", 0.02), ("mirrored", 0.5)]
+)
+def test_an_ambiguous_or_unproven_camera_is_not_registered(online, search, doubt, value):
+    usual = getattr(search, doubt)
+    setattr(search, doubt, value)
+    state, statuses = follow(online, OnlineState(), [frame("here", t) for t in TURNS[:5]])
+    assert statuses[-1] == NOT_REGISTERED
+    setattr(search, doubt, usual)
+    assert follow(online, state, [frame("here", TURNS[5])])[1] == [REGISTERED]
 
-    def test_settings_out_of_range_are_refused(self) -> None:
+
+def test_unexplained_frames_do_not_register_a_camera_and_are_not_kept(online):
+    state, statuses = follow(online, OnlineState(), [frame("nowhere", t) for t in TURNS])
+    assert (set(statuses), len(state.keyframes)) == ({NOT_REGISTERED}, 6)
+    frames = [frame("here", t) for t in TURNS[:4]]
+    frames.insert(1, frame("nowhere", TURNS[5]))
+    state, statuses = follow(online, OnlineState(), frames)
+    assert (statuses[-1], names(state)) == (REGISTERED, {"here"})
+    for bad in ({"least_frames": 2}, {"newest": 1}, {"most_frames": 4}):
         with pytest.raises(SettingsError, match="newest <= least_frames"):
-            OnlineSettings(least_frames=2)
+            OnlineSettings(**bad)
 
 
-class TestMovedCamera:
-    @pytest.fixture
-    def known(self, online: OnlineRegistration) -> OnlineState:
-        return follow(online, OnlineState(), [frame("here", t) for t in TURNS[:5]])[0]
+@pytest.fixture
+def known(online: OnlineRegistration) -> OnlineState:
+    return follow(online, OnlineState(), [frame("here", t) for t in TURNS[:5]])[0]
 
-    def test_is_found_when_outliers_agree_with_each_other(self, online, search, known) -> None:
-        state, statuses = follow(online, known, [frame("there", t) for t in TURNS[4:]])
-        # Three outliers contradict the pose, the fourth determines the new one.
-        assert statuses == [REGISTERED, REGISTERED, CONTRADICTED, REGISTERED]
-        assert (search.searches, state.moves) == (2, 1)
-        assert registered_at(state, 2.0)
-        assert names(state) == {"there"}
 
-    def test_is_noticed_while_the_body_does_not_move(self, online, search, known) -> None:
-        before = search.refinements
-        _, statuses = follow(online, known, [frame("there", TURNS[4])] * 6)
-        assert statuses == [REGISTERED] * 2 + [CONTRADICTED] * 4
-        # One pose of the body does not determine the camera: each frame is only compared with
-        # earlier ones.
-        assert (search.searches, search.refinements - before) == (1, 6)
+def test_a_moved_camera_is_found_when_outliers_agree_with_each_other(online, search, known):
+    """Three outliers contradict the pose, the fourth determines the new one."""
+    state, statuses = follow(online, known, [frame("there", t) for t in TURNS[4:]])
+    assert statuses == [REGISTERED, REGISTERED, CONTRADICTED, REGISTERED]
+    assert (search.searches, state.moves, names(state)) == (2, 1, {"there"})
+    assert registered_at(state, 2.0)
+    # One pose of the body does not determine the camera: each frame is only compared.
+    before = search.refinements
+    _, statuses = follow(online, known, [frame("there", TURNS[4])] * 6)
+    assert statuses == [REGISTERED] * 2 + [CONTRADICTED] * 4
+    assert (search.searches, search.refinements - before) == (2, 6)
+    # An uncertain pose is corrected without a motion.
+    search.deviation = 0.3
+    state, statuses = follow(online, known, [frame("there", t) for t in TURNS[4:]])
+    assert (statuses[-1], state.moves) == (REGISTERED, 0)
+    assert registered_at(state, 2.0)
 
-    def test_occluded_frames_are_no_motion(self, online, known) -> None:
-        state, statuses = follow(online, known, [frame("nowhere", t) for t in TURNS])
-        assert statuses == [REGISTERED] * 2 + [CONTRADICTED] * 6
-        assert state.registered is known.registered
-        state, statuses = follow(online, state, [frame("here", TURNS[6])])
-        assert statuses == [REGISTERED]
-        assert (state.moves, state.outlier_frames) == (0, ())
 
-    def test_an_uncertain_pose_is_corrected_without_a_motion(self, online, search, known) -> None:
-        search.deviation = 0.3
-        state, statuses = follow(online, known, [frame("there", t) for t in TURNS[4:]])
-        assert (statuses[-1], state.moves) == (REGISTERED, 0)
-        assert registered_at(state, 2.0)
+def test_occluded_frames_are_no_motion(online, known):
+    state, statuses = follow(online, known, [frame("nowhere", t) for t in TURNS])
+    assert statuses == [REGISTERED] * 2 + [CONTRADICTED] * 6
+    assert state.registered is known.registered
+    state, statuses = follow(online, state, [frame("here", TURNS[6])])
+    assert (statuses, state.moves, state.outlier_frames) == ([REGISTERED], 0, ())
+    places = ["here", "nowhere", "here", "nowhere", "nowhere", "here"]
+    turns = np.resize(TURNS[5:], len(places))
+    state, statuses = follow(online, known, [*map(frame, places, turns)])
+    assert (set(statuses), state.moves, names(state)) == ({REGISTERED}, 0, {"here"})
 
-    def test_a_few_outlier_frames_are_ignored(self, online, known) -> None:
-        places = ["here", "nowhere", "here", "nowhere", "nowhere", "here"]
-        turns = np.resize(TURNS[5:], len(places))
-        frames = [frame(place, t) for place, t in zip(places, turns, strict=True)]
-        state, statuses = follow(online, known, frames)
-        assert set(statuses) == {REGISTERED}
-        assert state.moves == 0
-        assert "nowhere" not in names(state)
 
-    def test_a_small_motion_is_found_from_the_newest_keyframes(self, online, known) -> None:
-        state, statuses = follow(online, known, [frame("a little off", t) for t in TURNS[5:]])
-        assert set(statuses) == {REGISTERED}
-        assert state.moves == 1
-        assert [one.name for one in state.keyframes] == ["a little off"] * 3
-        assert registered_at(state, 1.62)
-        # Poses that differed as much before are no motion.
-        restless = replace(known, distances=(5000.0,) * 12)
-        state, _ = follow(online, restless, [frame("a little off", t) for t in TURNS[5:]])
-        assert state.moves == 0
+def test_a_small_motion_is_found_from_the_newest_keyframes(online, known):
+    moved = [frame("a little off", t) for t in TURNS[5:]]
+    state, statuses = follow(online, known, moved)
+    assert (set(statuses), state.moves) == ({REGISTERED}, 1)
+    assert [one.name for one in state.keyframes] == ["a little off"] * 3
+    assert registered_at(state, 1.62)
+    # Poses that differed as much before are no motion.
+    assert follow(online, replace(known, distances=(5000.0,) * 12), moved)[0].moves == 0
 
 
 AXIS = np.array([0.48, -0.6, 0.64])

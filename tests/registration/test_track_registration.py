@@ -153,7 +153,7 @@ def test_offsets_that_explain_much_better_are_named(monkeypatch, scene, offset, 
     scene.see(np.array([LATE, 0.0, 0.0, offset]))
     # Begin at the right pose, in place of a search.
     start = [X_LC], np.zeros(5), 0.7, 0.1
-    monkeypatch.setattr(track_registration, "_search", lambda *_: start)
+    monkeypatch.setattr(track_registration, "search_pose", lambda *_: start)
     found = scene.register()
     assert found.likely == named
     assert np.abs(error(found.found.camera.X_WC)).max() < 0.01
@@ -193,7 +193,7 @@ def test_intervals_of_offsets_are_students(scene: Scene) -> None:
     deviations = np.array([1.0] * 8 + [0.1, 0.1, 0.02])
     constants = np.array([0.0, 0.0, 0.3, 0.2, -0.1])
     fit = TrackFit(X_LC, constants, np.zeros((0, 3)), 1.0, np.eye(11), np.zeros(0))
-    found = track_registration._describe_offsets(JOINTS, JOINTS, problem, fit, deviations)
+    found = track_registration.describe_offsets(JOINTS, JOINTS, problem, fit, deviations)
     law = scipy_t(6)
     for one, value, sd in zip(found, constants[2:], deviations[8:], strict=True):
         assert (one.value, one.deviation) == (value, sd)

@@ -359,9 +359,9 @@ def require_jacobian(
     # Two step sizes bound the error of the numerical Jacobian.
     row = np.abs(fine).max(axis=1, keepdims=True)
     allowed = 1e-4 * (np.abs(slope) + np.abs(fine)) + 1e-6 * (1.0 + row) + 4 * np.abs(fine - coarse)
-    measured = np.isfinite(value)[:, None] & np.isfinite(allowed)
-    # The negation also catches a Jacobian that is NaN where the value is finite.
-    wrong = measured & ~(np.abs(slope - fine) <= allowed)
+    known = np.isfinite(value) & np.isfinite(fine - coarse).all(axis=1)
+    # The negation also catches a Jacobian that is not finite where the value is.
+    wrong = known[:, None] & ~(np.abs(slope - fine) < allowed)
     if wrong.any():
         i, k = np.argwhere(wrong)[0]
         raise SettingsError(

@@ -307,8 +307,8 @@ def update(
 def slices(free: Belief, wide: Updated) -> Iterator[tuple[float, Belief]]:
     """Yield parts of a belief before an update, with logarithms of their weights.
 
-    Their mixture is the belief. They are so narrow along the direction of ``wide``, the belief's
-    update, that the measurement is straight over each.
+    Their mixture is the belief without its tails beyond 2.5 standard deviations. Along the
+    direction of ``wide``, the belief's update, the measurement is straight over each.
     """
     a = wide.direction
     assert a is not None

@@ -13,8 +13,7 @@ from drake_pose.jobs.estimate import inputs
 from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.scenes import load_scene
-from tests.filtering.tracking.test_colours import make_background, painted
-from tests.filtering.tracking.test_match_and_track import swings
+from tests.filtering.tracks import make_background, painted, swings
 from tests.jobs.scenes import edit_camera, write_joints
 from tests.registration.episodes import painted_episode
 from tests.registration.recordings import write_episode

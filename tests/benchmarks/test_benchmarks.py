@@ -2,31 +2,11 @@
 
 import numpy as np
 import pytest
-from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
-from drake_pose.body import load_model
 from drake_pose.commands.main import app
-from tests.benchmarks import figures, memory, registration, rooms
+from tests.benchmarks import figures, memory, registration
 from tests.benchmarks.tables import print_table
-from tests.body.models import joint, link, urdf, write
-from tests.registration.arm_pictures import damaged
-
-
-def test_damage_moves_the_edge_by_two_pixels_at_most_and_cuts_holes():
-    mask = np.zeros((200, 300), dtype=bool)
-    mask[50:150, 60:240] = True
-    outside = ndimage.distance_transform_cdt(~mask, metric="chessboard")
-    sizes = set()
-    for seed in range(40):
-        drawn = damaged(mask, np.random.default_rng(seed))
-        assert outside[drawn].max() <= 2
-        rows, columns = np.nonzero(drawn)
-        width, height = np.ptp(columns) + 1, np.ptp(rows) + 1
-        sizes.add(width - 180)
-        # Holes of 3 %, slightly more with the last one; dilated masks have round corners.
-        assert 0.92 < np.count_nonzero(drawn) / (width * height) < 0.972
-    assert sizes == {-4, -2, 0, 2, 4}
 
 
 def test_pose_errors_are_recovered():
@@ -75,16 +55,3 @@ def test_no_table_of_figures_is_typed_by_hand():
         (k,) = (k for k, text in enumerate(texts) if figures.markers(name)[0] in text)
         texts[k] = figures.replaced(texts[k], name, "")
     assert not any("\n|" in text for text in texts)
-
-
-def test_followers_are_drawn_where_their_model_has_them(tmp_path, monkeypatch):
-    monkeypatch.setattr(rooms, "_PICTURES", 2)
-    finger, mimic = 'lower="0" upper="0.8"', '<mimic joint="lead" multiplier="0.5" offset="0.1"/>'
-    lead = joint("lead", "revolute", "world", "one", limits=finger)
-    other = joint("other", "revolute", "world", "two", limits=finger, more=mimic)
-    text = urdf(link("world", ""), link("one"), link("two"), lead, other)
-    model = load_model(write(tmp_path, text), check=False)
-    drawn = rooms.simulate(model, tmp_path, 1).positions
-    lead, other = (drawn[:, model.position_index(name)] for name in ("lead", "other"))
-    assert np.ptp(lead) > 0.1
-    np.testing.assert_allclose(other, 0.5 * lead + 0.1)

@@ -218,6 +218,17 @@ def test_the_folders_are_those_of_the_library() -> None:
     assert len(listed) == len(folders)
 
 
+def test_the_ways_of_a_picture_lead_through_functions_that_exist() -> None:
+    rows = re.findall(
+        r"^\| [^|]* \| (`\w+/.*?) \| (`.*?) \| .* \|$", TEXTS["CONTRIBUTING.md"], re.M
+    )
+    for files, functions in rows:
+        text = "".join((ROOT / "drake_pose" / one).read_text() for one in files.split("`")[1::2])
+        for name in re.findall(r"`[\w.]*?(\w+)`", functions):
+            assert re.search(rf"(def|class) {name}\b", text), f"{name} is not in {files}"
+    assert len(rows) > 30
+
+
 def test_every_package_has_an_api_page() -> None:
     pages = {page.stem for page in (ROOT / "docs").glob("*.rst")}
     folders = {path.parent.name for path in (ROOT / "drake_pose").glob("*/__init__.py")}

@@ -12,7 +12,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
@@ -23,6 +22,7 @@ from drake_pose.search.branch_and_bound import PartialPoseGraph, PosesWithin, br
 from drake_pose.search.estimates import JointEstimate, PoseEstimate, PoseMode, PoseSet, View
 from drake_pose.search.partial_poses import BoundLimits, expand_groups
 from drake_pose.search.sampled_body import SampledBody, SampledTree
+from drake_pose.silhouette.pictures.masks import count_edge_pixels
 
 
 def grid_steps(grid: np.ndarray) -> np.ndarray:
@@ -260,9 +260,7 @@ def samples_at(sampled: SampledTree, node_values: Sequence[np.ndarray]) -> np.nd
 
 def contour_length(views: Sequence[View]) -> int:
     """Return the number of silhouette pixels with a 4-neighbour in the image outside [pixel]."""
-    cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
-    masks = [view.mask.view(np.uint8) for view in views]
-    return sum(cv2.countNonZero(mask) - cv2.countNonZero(cv2.erode(mask, cross)) for mask in masks)
+    return sum(count_edge_pixels(view.mask) for view in views)
 
 
 def renderer_tolerance(views: Sequence[View]) -> float:

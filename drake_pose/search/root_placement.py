@@ -379,14 +379,13 @@ class RootPlacementSearch:
         factor, camera = math.exp(parameters[-1]), start.views[0].camera
         if factor == 1.0 or not isinstance(camera, ParallelCamera):
             return refined
-        p_WR = slide_root(camera, self._root_of(refined), 1.0 / factor)
-        values = self._refined.node_values(parameters)
-        return _PlacedPose(
-            (View(scale_camera(camera, factor), start.views[0].mask),),
-            start.scale * factor,
-            self._refined.parameters(values, p_WR),
-            refined.J,
-        )
+        p_WR = self._root_of(refined)
+        if moves:
+            p_WR = slide_root(camera, p_WR, 1.0 / factor)
+        views = (View(scale_camera(camera, factor), start.views[0].mask),)
+        parameters = self._refined.parameters(self._refined.node_values(parameters), p_WR)
+        J = float(RefinementProblem(self._refined, views).J(parameters))
+        return _PlacedPose(views, start.scale * factor, parameters, J)
 
     def _root_of(self, placed: _PlacedPose) -> np.ndarray:
         """Return the position (3,) of a pose's root in the world [m]."""

@@ -9,7 +9,7 @@ from scipy.stats import t as student
 
 from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import ParallelCamera
-from drake_pose.errors import MaskError
+from drake_pose.errors import MaskError, SettingsError
 from drake_pose.search import (
     JointEstimate,
     MultiStartSearch,
@@ -19,6 +19,7 @@ from drake_pose.search import (
     View,
     covariance_pose_set,
 )
+from drake_pose.search.estimates import require_views
 from tests.search.arms import crane, views_of
 from tests.search.bodies import front_camera
 
@@ -26,26 +27,24 @@ TURN = 2.0 * math.pi
 CAMERA = ParallelCamera("front", 6, 4, 10.0, 3.0, 2.0, np.eye(4))
 
 
-@pytest.mark.parametrize("largest", [1, 255, np.uint8(255), 0.5, True])
-def test_any_array_of_two_values_is_a_mask(largest):
+def test_any_array_of_two_values_is_a_mask():
+    """A mask of one value is full, if that is not 0."""
     inside = np.arange(24).reshape(4, 6) % 5 == 0
-    view = View(CAMERA, inside * largest)
-    assert view.mask.dtype == np.bool_
-    np.testing.assert_array_equal(view.mask, inside)
-
-
-@pytest.mark.parametrize(
-    ("mask", "reason"),
-    [
+    for largest in (1, 255, np.uint8(255), 0.5, True):
+        view = View(CAMERA, inside * largest)
+        assert view.mask.dtype == np.bool_
+        np.testing.assert_array_equal(view.mask, inside)
+        assert View(CAMERA, np.full((4, 6), largest)).mask.all()
+    for mask, reason in (
         (np.arange(24).reshape(4, 6), "24 values from 0 to 23"),
-        (np.full((4, 6), np.nan), "values from nan"),
+        (np.where(inside, np.nan, 1.0), "values from"),
         (np.zeros((4, 6), int), "empty"),
         (np.ones((6, 4), int), "size the camera was calibrated for"),
-    ],
-)
-def test_invalid_masks_are_refused(mask, reason):
-    with pytest.raises(MaskError, match=f"'front'.*{reason}"):
-        View(CAMERA, mask)
+    ):
+        with pytest.raises(MaskError, match=f"'front'.*{reason}"):
+            View(CAMERA, mask)
+    with pytest.raises(SettingsError, match="one View"):
+        require_views(View(CAMERA, inside))
 
 
 @pytest.fixture(scope="module")
@@ -80,6 +79,10 @@ def test_masks_are_cut_at_straight_lines_alone():
             gone = np.array([200, 200]) - shape[::-1]
             moved = camera.project(p_W)[0] - cut.camera.project(p_W)[0]
             assert moved == pytest.approx(gone[None] * (side in (np.s_[:, :70], np.s_[:120])))
+    # A cut has at least eight pixels.
+    for width, rows in ((7, 200), (8, 150)):
+        bar = (abs(x - 100) <= width // 2) & (x < 100 + (width + 1) // 2) & (y >= 50)
+        assert View(camera, bar & (y < 199)).cut().mask.shape[0] == rows - (rows == 150)
 
 
 @pytest.mark.parametrize("around", [0.0, TURN, -2.0 * TURN])
@@ -156,11 +159,6 @@ def test_errors_are_fractions_of_the_silhouettes_area(tree):
     assert not PoseEstimate.nothing(tree, stopped_by="end").found
     intervals = pose.pose_set.position_intervals(tree)
     np.testing.assert_allclose(intervals, [[1.0, 1.0], [0.4, 0.1], [0.6, 0.3]])
-
-
-@pytest.mark.parametrize("mask", [np.full((4, 6), 3), np.full((4, 6), True)])
-def test_a_mask_of_one_value_is_full(mask):
-    assert View(CAMERA, mask).mask.all()
 
 
 def test_covariance_gives_student_intervals_within_limits(tree):

@@ -110,16 +110,6 @@ def test_pose_set_matches_its_definition(maker, tolerance):
         assert mode.J == problem.objective(mode.node_values)
 
 
-def test_a_better_pose_replaces_the_known_one(flipping_body):
-    problem = flipping_body.make(np.random.default_rng(23), views=1, on_grid=True)
-    worse = int(np.argsort(problem.Js)[40])
-    J = float(problem.Js[worse])
-    assert J > 0.0
-    answer = find_modes(problem.body, problem.views, problem.choices[worse], J, tolerance=0.0)
-    assert answer.modes[0].J == problem.best[1]
-    assert answer.size == len(problem.within(problem.best[1]))
-
-
 @pytest.mark.parametrize("limits", [{"time_limit": 0.0}, {"states": 1}, {"pairs": 1}])
 def test_a_limit_keeps_the_best_pose_and_is_reported(flipping_body, limits):
     problem = flipping_body.make(np.random.default_rng(24), views=1)

@@ -107,47 +107,62 @@ def seen(body):
     return View(camera, picture(body, camera, PLACE))
 
 
-def placed(tree, views, *position, **settings):
-    return RootPlacementSearch(tree, SETTINGS, **settings).match(views, *position)
+SIDE = replace(
+    front_camera(160),
+    name="side",
+    X_WC=np.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    @ front_camera(160).X_WC,
+)
 
 
-def test_position_and_scale_of_a_parallel_camera_are_found(body, seen):
-    views, found = [View(replace(seen.camera, pixels_per_metre=7.0), seen.mask)], []
-    for workers in (1, 3):
-        with use_workers(workers):
-            found.append(placed(body.pose_tree(), views, scale_unknown=True))
-    result, again = found
-    np.testing.assert_array_equal(result.q, again.q)
-    assert (result.runs, result.first_J) == (again.runs, again.first_J)
-    assert result.E_total < 0.04
-    assert result.scale * 7.0 == pytest.approx(100.0, rel=0.04)
-    assert result.root_position[1:] == pytest.approx(PLACE[1:], abs=0.02)
+@pytest.mark.parametrize(
+    ("cameras", "position", "axes", "given"),
+    [
+        # A camera's wrong scale is found; along its axis the position is arbitrary.
+        ([front_camera(160)], PLACE, "yz", {"scale": 100.0 / 7.0}),
+        ([front_camera(160)], PLACE, "yz", {}),
+        ([front_camera(160)], PLACE, "xyz", {"known": True}),
+        ([front_camera(160)], PLACE, "xyz", {"known": True, "scale": 2.0}),
+        # A pinhole sees the depth, two cameras the position in space.
+        ([EYE], np.array([3.8, 0.05, 0.1]), "xyz", {}),
+        ([front_camera(160), SIDE], np.array([0.21, -0.12, 0.18]), "xyz", {}),
+    ],
+)
+def test_positions_and_scales_are_found(body, cameras, position, axes, given):
+    scale, known = given.get("scale", 1.0), position if "known" in given else None
+    shown = [picture(body, camera, position) for camera in cameras]
+    if "scale" in given:
+        (camera,) = cameras
+        cameras = [replace(camera, pixels_per_metre=camera.pixels_per_metre / scale)]
+    views = [View(*pair) for pair in zip(cameras, shown, strict=True)]
+    search = RootPlacementSearch(body.pose_tree(), SETTINGS, scale_unknown="scale" in given)
+    result = search.match(views, known)
+    assert result.E_total < 0.06
+    assert result.scale == pytest.approx(scale, rel=0.04)
     assert max(angle_errors(body, result)) < 0.1
-    q_position = [result.q[body.position_index(f"slide_{axis}")] for axis in "yz"]
-    assert q_position == pytest.approx(result.root_position[1:])
+    for k, axis in enumerate("xyz"):
+        if axis in axes:
+            near = 0.08 if cameras == [EYE] else 1e-9 if known is not None else 0.03
+            assert result.root_position[k] == pytest.approx(position[k], abs=near)
+        q = result.q[body.position_index(f"slide_{axis}")]
+        assert q == pytest.approx(result.root_position[k], abs=1e-9)
 
 
-def test_depth_of_a_pinhole_is_found(body):
-    result = placed(body.pose_tree(), [View(EYE, picture(body, EYE, (3.8, 0.05, 0.1)))])
-    assert result.E_total < 0.05
-    # The camera is at x = 5 m.
-    assert 5.0 - result.root_position[0] == pytest.approx(1.2, rel=0.06)
-    assert result.root_position[1:] == pytest.approx([0.05, 0.1], abs=0.03)
-
-
-def test_two_cameras_find_the_position_in_space(body):
-    front = front_camera(160)
-    turn = np.array(
-        [[0.0, -1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0, 0, 0, 1]]
-    )
-    side = replace(front, name="side", X_WC=turn @ front.X_WC)
-    position = (0.21, -0.12, 0.18)
-    views = [View(camera, picture(body, camera, position)) for camera in (front, side)]
-    # With a single camera the position along its axis is arbitrary.
-    for count, known in ((2, slice(0, 3)), (1, slice(1, 3))):
-        result = placed(body.pose_tree(), views[:count])
-        assert result.E_total < 0.06
-        assert result.root_position[known] == pytest.approx(position[known], abs=0.03)
+def test_results_depend_neither_on_workers_nor_on_the_root(body, seen):
+    """The same silhouette is searched with the trunk and with an arm as the root."""
+    rotation = RootRotation.limited([("x", -180.0, 180.0)])
+    other = body.pose_tree("left", root_position=np.zeros(3), root_rotation=rotation)
+    found = []
+    for tree, workers in ((body.pose_tree(), 1), (body.pose_tree(), 3), (other, 1)):
+        with use_workers(workers):
+            found.append(RootPlacementSearch(tree, SETTINGS).match([seen]))
+    own, again, turned = found
+    np.testing.assert_array_equal(own.q, again.q)
+    assert (own.runs, own.first_J) == (again.runs, again.first_J)
+    assert abs(own.E_total - turned.E_total) < 0.03
+    # The plant's joints cannot turn the body about the arm, so X_WB is turned instead.
+    assert max(angle_errors(body, turned)[1:]) < 0.1
+    assert math.atan2(*turned.X_WB[[2, 1], 1]) == pytest.approx(TRUE_ANGLES["trunk_turn"], abs=0.1)
 
 
 def test_a_root_may_lie_beyond_the_image_border(body):
@@ -157,25 +172,6 @@ def test_a_root_may_lie_beyond_the_image_border(body):
     search = RootPlacementSearch(body.pose_tree(), SETTINGS)
     (layer,) = find_root_places(search.body, [View(camera, mask)], False, None)
     assert np.linalg.norm(layer.positions[:, 1:] - [0.1, 0.8], axis=1).min() < 0.04
-
-
-def test_another_root_gives_an_equally_good_pose(body, seen):
-    """The same silhouette is searched with the trunk and with an arm as the root."""
-    own = placed(body.pose_tree(), [seen])
-    rotation = RootRotation.limited([("x", -180.0, 180.0)])
-    tree = body.pose_tree("left", root_position=np.zeros(3), root_rotation=rotation)
-    turned = placed(tree, [seen])
-    assert abs(own.E_total - turned.E_total) < 0.03
-    # The plant's joints cannot turn the body about the arm, so X_WB is turned instead.
-    assert max(angle_errors(body, own)) < 0.1
-    assert max(angle_errors(body, turned)[1:]) < 0.1
-    assert math.atan2(*turned.X_WB[[2, 1], 1]) == pytest.approx(TRUE_ANGLES["trunk_turn"], abs=0.1)
-
-
-def test_a_known_position_is_kept(body, seen):
-    result = placed(body.pose_tree(), [seen], PLACE)
-    assert result.root_position == pytest.approx(PLACE)
-    assert result.E_total < 0.04
 
 
 def test_a_zero_time_limit_returns_a_placement(body, seen):

@@ -16,7 +16,7 @@ from drake_pose.fit.covariance import (
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.surfaces import simplify_surfaces
 from drake_pose.search import View, ViewsFit, views_fit
-from drake_pose.search.self_motions import Flip, flips
+from drake_pose.search.self_motions import Flip
 from drake_pose.search.views_fit import (
     FittedPose,
     RobustModes,
@@ -58,19 +58,6 @@ def test_intervals_contain_the_true_values_and_widen_with_damage(kinematics):
     assert np.all(np.array(widths[0]) < np.radians(10.0))
     # Also without damage an error of a pixel in each camera is assumed.
     assert np.median(np.array(widths[1]) / widths[0]) > 1.03
-
-
-def test_flips_are_separate_modes(kinematics):
-    """If no difference is significant, all flips are modes and no value is determined."""
-    tree = kinematics.tree
-    views = [draw_view(tree, TRUTH, camera) for camera in arm_cameras()]
-    nothing = RobustSettings(significance=1e6, modes=5)
-    assert not any(find(kinematics, views, TRUTH, nothing).determined)
-    answer = find(kinematics, damaged_views(tree, TRUTH, 1), TRUTH)
-    flipped = [flip.values for flip in flips(kinematics, answer.modes[0].q)]
-    for mode in answer.modes[1:]:
-        gaps = [np.abs(mode.q - values).max() for values in flipped]
-        assert min(gaps) < np.radians(15.0)
 
 
 def test_a_turn_about_an_axis_of_symmetry_is_not_determined(tmp_path):

@@ -1,11 +1,19 @@
 """Small surfaces, and an independent brute-force renderer."""
 
 import numpy as np
+import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
 from drake_pose.body import TriangleMesh
-from drake_pose.camera.models import Camera
+from drake_pose.camera.models import Camera, ParallelCamera, PinholeCamera
+
+CAMERAS: list[Camera] = [
+    ParallelCamera("parallel", 90, 70, 60.0, 44.3, 33.1, np.eye(4)),
+    PinholeCamera("pinhole", 90, 70, 100.0, 110.0, 44.3, 33.1, np.eye(4), near=0.1),
+    PinholeCamera("off_centre", 61, 83, 150.0, 140.0, -20.3, 91.7, np.eye(4), near=0.1),
+]
+each_camera = pytest.mark.parametrize("camera", CAMERAS, ids=lambda camera: camera.name)
 
 
 def random_pose(rng: np.random.Generator, position: tuple[float, float, float]) -> np.ndarray:

@@ -106,15 +106,6 @@ def test_occluded_surfaces_have_no_points():
     assert np.allclose(np.sort(twice.uv, axis=0), np.sort(once.uv, axis=0))
 
 
-def test_scaled_pose_equals_scaled_body_in_a_parallel_camera():
-    camera, X = CAMERAS[0], random_pose(np.random.default_rng(2), (0.0, 0.0, 0.0))
-    scaled = X * np.append(3 * [1.3], 1.0)
-    small = find_contour_points((outline_from_mesh(box(0.5)),), scaled[None], camera)
-    large = find_contour_points((outline_from_mesh(box(0.65)),), X[None], camera)
-    assert np.allclose(small.uv, large.uv)
-    assert np.allclose(1.3 * small.p_N, large.p_N)
-
-
 def test_body_outside_the_image_has_no_points():
     beside, behind = np.eye(4)[None], np.eye(4)[None]
     beside[0, 0, 3], behind[0, 2, 3] = 50.0, -2.0

@@ -191,20 +191,24 @@ def _find_repeats(scene: Scene, min_change: float = 0.02) -> tuple[dict[str, lis
 def _check_gaps(frames: Sequence[str]) -> list[str]:
     """Return one warning about numbers missing between consecutively numbered frames, or none.
 
-    Numbers are missing where a step between frames is larger than the median step.
+    Numbers are missing where a step between frames is twice the median step or more. Names that
+    differ in more than the last number are not consecutive.
     """
     keys = [natural_key(frame) for frame in frames]
-    if len(keys) < 3 or any(key[:-2] != keys[0][:-2] or key[-1][0] for key in keys):
+    if len(keys) < 3 or any(key[-1][0] for key in keys):
+        return []
+    if len({(key[:-2], key[-2][0]) for key in keys}) > 1:
         return []
     steps = np.diff([key[-2][1] for key in keys])
-    usual_step = int(np.median(steps))
-    wide = np.flatnonzero(steps > usual_step) if usual_step > 0 else np.empty(0, dtype=int)
+    usual_step = max(1, int(np.median(steps)))
+    missing = steps // usual_step - 1
+    wide = np.flatnonzero(missing > 0)
     if not len(wide):
         return []
-    missing = int((steps[wide] // usual_step - 1).sum())
+    count, first = missing[wide].sum(), wide[0]
     return [
-        f"{missing} frames dropped by all cameras, the first between {frames[wide[0]]} and "
-        f"{frames[wide[0] + 1]}; the times of all later frames do not include them"
+        f"{count} frames dropped by all cameras, the first between {frames[first]} and "
+        f"{frames[first + 1]}; the times of all later frames do not include them"
     ]
 
 

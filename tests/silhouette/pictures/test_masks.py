@@ -1,4 +1,4 @@
-"""Mask files, label images and agreement between masks; COCO files against matplotlib."""
+"""Mask files and agreement between masks; COCO files against matplotlib and pycocotools."""
 
 import json
 import struct
@@ -10,15 +10,16 @@ import numpy as np
 import pytest
 from matplotlib.path import Path as MplPath
 from pycocotools import mask as coco
-from pydrake.geometry import RenderLabel
-from pydrake.systems.sensors import ImageLabel16I
+from scipy.ndimage import binary_erosion
 
 from drake_pose.camera.picture_files import read_binary_mask, read_picture, threshold_mask
 from drake_pose.errors import MaskError, SceneError
-from drake_pose.silhouette.pictures.label_renderer import label_image_to_mask, mask_to_label_image
 from drake_pose.silhouette.pictures.masks import (
     compare_masks,
+    count_edge_pixels,
     draw_area,
+    intersection_over_union,
+    is_coco,
     original_files,
     read_coco,
     read_mask,
@@ -60,62 +61,44 @@ def test_every_variant_of_mask_is_read(tmp_path, picture):
     np.testing.assert_array_equal(read_picture(tmp_path / "m.png")[..., 0], GREY)
 
 
+def png_of_size(side):
+    """An empty PNG file whose header tells its size."""
+    header = struct.pack(">IIBBBBB", side, side, 8, 0, 0, 0, 0)
+    data = b"\x89PNG\r\n\x1a\n"
+    for kind, content in ((b"IHDR", header), (b"IEND", b"")):
+        checksum = struct.pack(">I", zlib.crc32(kind + content))
+        data += struct.pack(">I", len(content)) + kind + content + checksum
+    return data
+
+
 def test_invalid_masks_are_refused(tmp_path):
-    for picture, message in (
+    path = save(tmp_path, GREY)
+    data = path.read_bytes()
+    pictures = (
         (np.zeros_like(GREY), "empty"),
         (np.full_like(GREY, 255), "full"),
         (cv2.GaussianBlur(GREY, (5, 5), 0), "values"),
         (np.dstack([GREY, GREY, np.roll(GREY, 3, axis=1)]), "values"),
         (np.where(MASK, 255, 3).astype(np.uint8), "full"),
         (GREY.T.copy(), r"20 x 30 pixels.*30 x 20"),
-    ):
+    )
+    ends, places = (0, 5, 8, 20, 40, len(data) - 13, len(data) - 8), (9, 14, 18, 30, len(data) - 20)
+    damaged = [(data[:end], "(not a PNG|truncated|damaged)") for end in ends]
+    damaged += [(data[:k] + bytes([data[k] ^ 0x55]) + data[k + 1 :], "") for k in places]
+    damaged += [(png_of_size(side), "too large") for side in (10_000, 60_000)]
+    damaged.append((cv2.imencode(".jpg", GREY)[1].tobytes(), "not a PNG"))
+    for content, message in (*pictures, *damaged):
+        if isinstance(content, bytes):
+            path.write_bytes(content)
+        else:
+            save(tmp_path, content)
         with pytest.raises(MaskError, match=rf"0007\.png.*{message}"):
-            read_mask(save(tmp_path, picture), 30, 20)
-
-
-def test_damaged_files_are_refused(tmp_path):
-    path = save(tmp_path, MASK.astype(np.uint8) * 255)
-    data = path.read_bytes()
-    for end in (0, 5, 8, 20, 40, len(data) - 13, len(data) - 8):
-        path.write_bytes(data[:end])
-        with pytest.raises(MaskError, match=r"0007\.png: .*(not a PNG|truncated|damaged)"):
-            read_mask(path)
-    for place in (9, 14, 18, 30, len(data) - 20):
-        path.write_bytes(data[:place] + bytes([data[place] ^ 0x55]) + data[place + 1 :])
-        with pytest.raises(MaskError, match=r"0007\.png: "):
-            read_mask(path)
-
-
-@pytest.mark.parametrize("side", [10_000, 60_000])
-def test_huge_pictures_are_refused(tmp_path, side):
-    header = struct.pack(">IIBBBBB", side, side, 8, 0, 0, 0, 0)
-    data = b"\x89PNG\r\n\x1a\n"
-    for kind, content in ((b"IHDR", header), (b"IEND", b"")):
-        checksum = struct.pack(">I", zlib.crc32(kind + content))
-        data += struct.pack(">I", len(content)) + kind + content + checksum
-    (tmp_path / "bomb.png").write_bytes(data)
-    with pytest.raises(MaskError, match=r"bomb\.png.*too large"):
-        read_mask(tmp_path / "bomb.png")
-    photo = bytearray(cv2.imencode(".jpg", np.zeros((20, 30, 3), np.uint8))[1].tobytes())
-    size = photo.index(b"\xff\xc0") + 5
-    photo[size : size + 4] = struct.pack(">HH", side, side)
-    (tmp_path / "bomb.jpg").write_bytes(photo)
-    with pytest.raises(SceneError, match=r"bomb\.jpg.*too large"):
-        read_picture(tmp_path / "bomb.jpg")
-    with (tmp_path / "sparse.png").open("wb") as file:
+            read_mask(path, 30, 20)
+    with path.open("wb") as file:
         file.truncate(1 << 40)
-    with pytest.raises(MaskError, match=r"sparse\.png.*larger than 2 GiB"):
-        read_mask(tmp_path / "sparse.png")
-
-
-def test_unreadable_files_are_refused(tmp_path):
-    for path in (tmp_path / "missing.png", tmp_path):
-        with pytest.raises(MaskError, match=str(path)):
-            read_mask(path)
-    picture = tmp_path / "photo.png"
-    picture.write_bytes(cv2.imencode(".jpg", GREY)[1].tobytes())
-    with pytest.raises(MaskError, match="not a PNG"):
-        read_mask(picture)
+    for name, message in (("0007.png", "larger than 2 GiB"), ("missing.png", ""), ("", "")):
+        with pytest.raises(MaskError, match=rf"{tmp_path / name}.*{message}"):
+            read_mask(tmp_path / name)
 
 
 def test_signed_distances_match_brute_force():
@@ -127,31 +110,19 @@ def test_signed_distances_match_brute_force():
         nearest = np.linalg.norm(others - [row, column], axis=1).min() - 0.5
         expected = -nearest if mask[row, column] else nearest
         assert found[row, column] == pytest.approx(expected, abs=1e-4)
-
-
-def test_mask_survives_conversion_to_label_image():
-    image = mask_to_label_image(MASK)
-    assert isinstance(image, ImageLabel16I)
-    assert (image.width(), image.height()) == (30, 20)
-    assert {*np.unique(image.data).tolist()} == {1, int(RenderLabel.kEmpty)}
-    np.testing.assert_array_equal(label_image_to_mask(image), MASK)
-    np.testing.assert_array_equal(label_image_to_mask(image.data), MASK)
-
-
-def test_labels_can_be_chosen():
-    labels = np.full((4, 5), int(RenderLabel.kEmpty), dtype=np.int16)
-    labels[1, 2], labels[3, 3] = 7, 9
-    # Drake's reserved labels are not objects.
-    reserved = RenderLabel.kDontCare, RenderLabel.kDoNotRender, RenderLabel.kUnspecified
-    labels[0, :3] = [*map(int, reserved)]
-    assert np.argwhere(label_image_to_mask(labels)).tolist() == [[1, 2], [3, 3]]
-    assert np.argwhere(label_image_to_mask(labels, [9])).tolist() == [[3, 3]]
+    # An edge pixel has one of its four neighbours in the picture outside.
+    eroded = binary_erosion(mask, border_value=1)
+    assert count_edge_pixels(mask) == np.count_nonzero(mask & ~eroded)
 
 
 def test_E_total_is_the_differing_fraction_over_all_cameras():
     """One mask is right; the other lacks 10 of 85 pixels."""
     body = MASK.copy()
     body[4:9, 3:5] = False
+    assert compare_masks({"a": ~MASK & MASK}, {"a": ~MASK & MASK})[1] == {"a": 1.0}
+    assert np.isnan(compare_masks({}, {})[0])
+    shifted = np.roll(MASK, 2, axis=1)
+    assert intersection_over_union(MASK, shifted) == pytest.approx(75 / 95)
     E_total, ious = compare_masks({"a": MASK, "b": MASK}, {"a": MASK, "b": body})
     assert E_total == pytest.approx(10 / 170)
     assert ious == {"a": 1.0, "b": pytest.approx(75 / 85)}
@@ -265,10 +236,15 @@ def test_annotations_are_drawn_by_class_and_picture(tmp_path, classes):
     assert (first.draw(["arm"]) == (classes == 1)).all()
     assert (first.draw(["arm", "9"]) == (classes > 0)).all()
     assert not second.draw(["arm"]).any()
+    assert is_coco(tmp_path / "a.json")
+    for text in ('{"images": []}', '{"annotations": []}'):
+        (tmp_path / "b.json").write_text(text)
+        assert not is_coco(tmp_path / "b.json")
 
 
 def test_pictures_have_the_names_they_had_before_annotation():
     for names, expected in (
+        # As they are; Windows'; Label Studio's, with one or two prefixes; Roboflow's.
         (["front/frame_000001.PNG", "2.png"], ["front/frame_000001.PNG", "2.png"]),
         ([r"C:\data\front\1.png", r"D:\2.png"], ["data/front/1.png", "2.png"]),
         ([r"images\4\3a8d9f0c-1.jpg", "1a8d9f0c-2.jpg"], ["images/4/1.jpg", "2.jpg"]),
@@ -299,6 +275,9 @@ def test_other_files_and_damaged_annotations_are_refused(tmp_path):
         ({"area": {"image_id": []}}, "unhashable"),
         ({"image": {"id": 6}}, "image 6 is given twice"),
         ({"image": {"width": True}}, "whole numbers of 2 to"),
+        ({"image": {"height": 1}}, "whole numbers of 2 to"),
+        ({"image": {"height": 2.0}}, "whole numbers of 2 to"),
+        ({"image": {"file_name": ".."}}, "not a name of a picture"),
         ({"image": {"file_name": "a\0.png"}}, "not a name of a picture"),
         ({"image": {"file_name": 3}}, ""),
         ({"content": {"images": 3}}, "not iterable"),

@@ -17,6 +17,8 @@ from drake_pose.silhouette.pictures.scene_checks import (
     frame_ranges,
     leave_out_unreadable,
     read_mask_of,
+    read_scene,
+    require_readable,
 )
 from drake_pose.silhouette.pictures.scenes import load_scene
 from tests.camera.recordings import write_film
@@ -25,24 +27,28 @@ from tests.written_files import write_mask
 NAMES = ("left", "middle", "right")
 
 
-def record(folder, frames, still=()):
-    """Masks of a moving square; cameras in ``still`` freeze from the third frame on."""
+def square(at, part=np.s_[10:30]):
+    """A square of 20 pixels whose left edge is at column 5 + at."""
+    mask = np.zeros((40, 60), dtype=bool)
+    mask[part, 5 + at : 25 + at] = True
+    return mask
+
+
+def record(folder, frames, still=(), step=2):
+    """Masks of a square that moves by ``step``; cameras in ``still`` freeze from frame 3 on."""
     cameras = [ParallelCamera(n, 60, 40, 10.0, 30.0, 20.0, np.eye(4)) for n in NAMES]
     save_cameras(folder / "cameras.yaml", cameras)
     (folder / "scene.yaml").write_text("sequence: true\n")
     for name in NAMES:
-        (folder / "masks" / name).mkdir(parents=True)
+        (folder / "masks" / name).mkdir(parents=True, exist_ok=True)
         for k, frame in enumerate(frames):
-            mask = np.zeros((40, 60), dtype=bool)
-            at = 2 * (min(k, 2) if name in still else k)
-            mask[10:30, 5 + at : 25 + at] = True
+            mask = square(step * (min(k, 2) if name in still else k))
             write_mask(folder / "masks" / name / f"{frame}.png", mask)
     return load_scene(folder)
 
 
 def film(folder, rate, count=60, **changed):
     """Grey videos for every camera; ``changed``: rate and count of single cameras."""
-    (folder / "scene.yaml").write_text("sequence: true\n")
     for name in NAMES:
         own_rate, own_count = changed.get(name, (rate, count))
         pictures = [np.full((40, 60), k) for k in range(own_count)]
@@ -71,47 +77,64 @@ def test_videos_of_different_rates_or_lengths_are_reported(tmp_path):
 
 
 FROZEN = "shows its last picture again"
-DROPPED = "2 frames dropped by all cameras, the first between f_06 and f_12"
 
 
 @pytest.mark.parametrize(
-    ("frames", "still", "left_out", "words"),
+    ("frames", "still", "step", "left_out", "words"),
     [
         # Natural order: 9 before 10.
-        ("8 9 10 11 12", (), [], None),
-        ("1 2 3 4 5", ("middle",), ["4", "5"], f"'middle' {FROZEN} in frame 4-5"),
-        ("1 2 3 4", NAMES, [], "frame 4: all cameras show the previous frame again"),
-        ("f_02 f_04 f_06 f_12 f_14", (), [], DROPPED),
+        ("8 9 10 11 12", (), 2, (), None),
+        ("1 2 3 4 5", ("middle",), 2, "45", f"'middle' {FROZEN} in frame 4-5"),
+        ("1 2 3 4", NAMES, 2, (), "frame 4: all cameras show the previous frame again"),
+        ("1 2 3 4 5", ("left", "right"), 2, (), None),
+        ("1 2 3", (), 0, (), "frame 2-3: all cameras show the previous frame again"),
+        ("f_02 f_04 f_06 f_12 f_14", (), 2, (), "2 frames dropped by all cameras, the first "
+         "between f_06 and f_12"),
+        ("1 2 3 5 7 9", (), 2, (), None),
+        ("1 5", (), 2, (), None),
+        ("a1 b2 b9", (), 2, (), None),
+        ("2 4 6 9", (), 2, (), None),
+        ("1a 2a 9a", (), 2, (), None),
     ],
-)
-def test_faults_of_a_sequence_are_reported(tmp_path, frames, still, left_out, words):
-    scene = record(tmp_path, frames.split(), still)
+)  # fmt: skip
+def test_faults_of_a_sequence_are_reported(tmp_path, frames, still, step, left_out, words):
+    scene = record(tmp_path, frames.split(), still, step)
     assert " ".join(scene.frames) == frames
     checked = check_scene(scene)
     assert len(checked.warnings) == (words is not None)
     assert words is None or words in checked.warnings[0]
     assert scene.masks.keys() - checked.masks.keys() == {("middle", frame) for frame in left_out}
-    assert "dropped" not in "".join(check_scene(replace(scene, sequence=False)).warnings)
+    assert check_scene(replace(scene, sequence=False)).warnings == ()
+    lone = scene.of_cameras(["middle"])
+    assert (FROZEN in "".join(check_scene(lone).warnings)) is False
 
 
-def test_leading_zeros_do_not_distinguish_frames(tmp_path):
-    record(tmp_path, ["0001", "0002"])
-    for frame in ("0001", "0002"):
-        path = tmp_path / "masks" / "left" / f"{frame}.png"
-        path.rename(path.with_name(f"{int(frame)}.png"))
-    scene = load_scene(tmp_path)
-    assert scene.frames == ("0001", "0002")
-    assert check_scene(scene).warnings == ()
-    assert scene.masks["left", "0002"].name == "2.png"
+@pytest.mark.parametrize(("step", "frozen"), [(2, True), (0, False)])
+def test_a_camera_is_frozen_only_while_the_others_move(tmp_path, step, frozen):
+    """By more than 2 % of their silhouettes; else the body stood still, too."""
+    scene = record(tmp_path, "12345", ("middle",))
+    for name in ("left", "right"):
+        for k, frame in enumerate("12345"):
+            mask = square(step * k)
+            # A pixel of noise: the files differ.
+            mask[0, k] = True
+            write_mask(scene.masks[name, frame], mask)
+    checked = check_scene(load_scene(tmp_path))
+    assert (f"'middle' {FROZEN}" in " ".join(checked.warnings)) == frozen
 
 
-def test_misspelt_camera_is_reported(tmp_path):
-    record(tmp_path, ["1", "2"])
-    (tmp_path / "masks" / "middle").rename(tmp_path / "masks" / "Midle")
-    first, second = check_scene(load_scene(tmp_path)).warnings
-    assert "no camera 'Midle'" in first
-    assert "2 masks are left out: is it 'middle'?" in first
-    assert "camera 'middle' of cameras.yaml has no masks" in second
+def test_a_checked_scene_has_the_wanted_cameras_and_frames(tmp_path):
+    record(tmp_path, "1234")
+    (tmp_path / "masks" / "left" / "4.png").unlink()
+    scene, frames = read_scene(tmp_path, ["left"], ["1:3"], None, 2)
+    assert (frames, [*scene.cameras], scene.sequence) == (("1", "3"), ["left"], True)
+    (text,) = scene.warnings
+    assert "camera 'left' has 3 of 4 frames; it lacks 4" in text
+    (tmp_path / "scene.yaml").unlink()
+    assert not read_scene(tmp_path, [], [], None, 1)[0].sequence
+    assert read_scene(tmp_path, [], [], None, 1, sequence=True)[0].sequence
+    unknown = replace(scene, scale_unknown=True)
+    assert check_scene(unknown) is unknown
 
 
 def test_unreadable_masks_are_left_out_if_others_have_the_frame(tmp_path):
@@ -126,64 +149,61 @@ def test_unreadable_masks_are_left_out_if_others_have_the_frame(tmp_path):
     assert left.startswith("frame 2-3 without camera 'left'")
     assert right.startswith("frame 3 without camera 'right'")
     assert checked.cameras_of("3") == ("middle",)
-    with pytest.raises(MaskError, match=r"3\.png"):
+    assert leave_out_unreadable(scene, ["1"]).masks == scene.masks
+    with pytest.raises(MaskError, match=r"left/3\.png"):
         leave_out_unreadable(scene.of_cameras(("left", "right")), scene.frames)
+    refused = dict.fromkeys(scene.masks, "this file")
+    with pytest.raises(SceneError, match="none of 9 masks can be used: this file"):
+        require_readable(refused, scene)
+    del refused["left", "1"]
+    require_readable(refused, scene)
+    require_readable({}, replace(scene, masks={}))
 
 
-@pytest.mark.parametrize(("turn", "name"), [([180.0, 0.0, 0.0], "-z"), ([0.0, 90.0, 0.0], "+x")])
+@pytest.mark.parametrize(
+    ("turn", "name"),
+    [((180, 0, 0), "-z"), ((0, 90, 0), "+x"), ((-90, 0, 0), "+y"), ((90, 0, 0), "-y")],
+)
 def test_world_with_wrong_up_axis_is_reported(turn, name):
-    cameras = list(circle_of_cameras(4, size=(160, 120), face_camera=False).values())
+    cameras = [*circle_of_cameras(4, size=(160, 120), face_camera=False).values()]
     assert check_upright(cameras) == ()
     X = np.eye(4)
     X[:3, :3] = Rotation.from_rotvec(turn, degrees=True).as_matrix()
     (warning,) = check_upright([camera.with_pose(X @ camera.X_WC) for camera in cameras])
     assert f"is the world's {name}," in warning
+    # A camera that looks straight down says nothing about the world.
+    assert check_upright([ParallelCamera("top", 9, 9, 1.0, 4.0, 4.0, np.diag([1, -1, -1, 1]))])
+    down = np.eye(4)
+    down[:3, :3] = Rotation.from_rotvec([0.25 * np.pi, 0, 0]).as_matrix() @ np.diag([1, -1, -1])
+    two = [down, np.diag([-1, -1, 1, 1]) @ down]
+    assert check_upright([ParallelCamera("c", 9, 9, 1.0, 4.0, 4.0, X) for X in two]) == ()
 
 
 def test_consecutive_frames_become_ranges():
     known = [f"{k:02d}" for k in range(40)]
     assert frame_ranges(["03", "02", "07", "04"], known) == "02-04, 07"
     assert frame_ranges(known[::3], known) == "00, 03, 06, 09, 12, 15 and 8 more"
+    assert frame_ranges([], known) == ""
 
 
 def test_masks_that_fill_picture_and_edge_are_inverted(tmp_path):
     """More than half of the picture and more than three quarters of its edge."""
-    frames = {
-        "1": (np.s_[:, 2:], "white fills 97 %"),
-        "2": (np.s_[:, 4:], "white fills 93 %"),
-        "3": (np.s_[:, 6:], None),
-        "4": (np.s_[10:30, 5:55], None),
-    }
-    scene = record(tmp_path, frames)
-    for frame, (part, told) in frames.items():
+    frame = np.ones((40, 60), bool)
+    frame[6:34, 6:54] = False
+    parts = (np.s_[:, 2:], "97 %"), (np.s_[:, 4:], "93 %"), (np.s_[:, 6:], None)
+    cases = [(square(0, part=rows) | False, None) for rows in (np.s_[:], np.s_[5:])]
+    for part, told in parts:
         mask = np.zeros((40, 60), bool)
         mask[part] = True
-        write_mask(scene.masks["left", frame], mask)
-        with nullcontext() if told is None else pytest.raises(MaskError, match=told):
-            found = read_mask_of(scene, "left", frame, may_be_empty=False)
-            np.testing.assert_array_equal(found, mask)
+        cases.append((mask, told))
     # White along the edge alone, and nowhere.
-    edge = np.ones((40, 60), bool)
-    edge[6:34, 6:54] = False
-    for mask in (edge, edge & False):
-        write_mask(scene.masks["right", "1"], mask)
-        found = read_mask_of(load_scene(tmp_path), "right", "1", may_be_empty=True)
-        np.testing.assert_array_equal(found, mask)
-    with pytest.raises(MaskError):
-        read_mask_of(load_scene(tmp_path), "right", "1", may_be_empty=False)
-
-
-@pytest.mark.parametrize(("step", "frozen"), [(2, True), (0, False)])
-def test_a_camera_is_frozen_only_while_the_others_move(tmp_path, step, frozen):
-    """By more than 2 % of their silhouettes; else the body stood still, too."""
-    frames = [str(k) for k in range(5)]
-    scene = record(tmp_path, frames, ("middle",))
-    for name in ("left", "right"):
-        for k, frame in enumerate(frames):
-            mask = np.zeros((40, 60), bool)
-            mask[10:30, 5 + step * k : 25 + step * k] = True
-            # A pixel of noise: the files differ.
-            mask[0, k] = True
-            write_mask(scene.masks[name, frame], mask)
-    checked = check_scene(load_scene(tmp_path))
-    assert ("'middle' shows its last picture again" in " ".join(checked.warnings)) == frozen
+    cases += [(frame, None), (frame & False, None)]
+    scene = record(tmp_path, "1")
+    for mask, told in cases:
+        write_mask(scene.masks["left", "1"], mask)
+        fresh = load_scene(tmp_path)
+        with nullcontext() if told is None else pytest.raises(MaskError, match=told):
+            found = read_mask_of(fresh, "left", "1", may_be_empty=True)
+            np.testing.assert_array_equal(found, mask)
+    with pytest.raises(MaskError, match="empty"):
+        read_mask_of(load_scene(tmp_path), "left", "1", may_be_empty=False)

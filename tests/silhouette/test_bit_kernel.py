@@ -14,7 +14,7 @@ from drake_pose.silhouette.outline import outline_from_mesh
 from drake_pose.silhouette.scoring import VisualHull, draw_mask
 from tests.silhouette.shapes import soup
 
-_POSES = 120
+_POSES = 60
 
 
 def crooked_surface(seed):
@@ -97,55 +97,6 @@ def test_poses_beyond_the_limit_are_skipped():
 
 BALL = trimesh.creation.icosphere(3)
 ELLIPSOID = outline_from_mesh(TriangleMesh(BALL.vertices * [0.05, 0.08, 0.2], BALL.faces))
-
-
-def test_balls_are_inside_and_reach_the_ends():
-    balls = VisualHull(ELLIPSOID).spread_balls(8)
-    # Points on each ball in all directions are inside the ellipsoid.
-    directions = Rotation.random(300, random_state=1).as_matrix()[:, 0]
-    points = balls[:, None, :3] + balls[:, None, 3:] * directions
-    assert np.linalg.norm(points / [0.05, 0.08, 0.2], axis=2).max() <= 1.0
-    assert 0.03 < balls[:, 3].max() < 0.05
-    assert np.ptp(balls[:, 2]) > 0.2
-
-
-def test_hull_of_a_ball_is_the_ball():
-    """Radii fall with the distance from the centre, alike in all directions; 0 outside."""
-    made = trimesh.creation.icosphere(4, radius=0.3)
-    made.apply_translation([0.1, 0.2, -0.1])
-    hull = VisualHull(outline_from_mesh(TriangleMesh(np.array(made.vertices), made.faces)))
-    directions = Rotation.random(60, random_state=2).as_matrix()[:, 0]
-    scale = 0.46 * 96 / 0.3
-    for away in (0.0, 0.1, 0.2):
-        radii = hull.radii([0.1, 0.2, -0.1] + away * directions)
-        np.testing.assert_allclose(radii, 0.97 * (0.3 - away - 1.25 / scale), atol=1.6 / scale)
-    assert not hull.radii([0.1, 0.2, -0.1] + 0.31 * directions).any()
-    assert not hull.radii(np.full((1, 3), 5.0)).any()
-
-
-def test_each_ball_reaches_farthest_beyond_those_before_it():
-    hull = VisualHull(ELLIPSOID)
-    few, more = (hull.spread_balls(count, points_per_side=9) for count in (4, 9))
-    np.testing.assert_array_equal(few, more[:4])
-    np.testing.assert_allclose(more[:, 3], hull.radii(more[:, :3]))
-    steps = 0.2 * np.linspace(-1.0, 1.0, 9)
-    grid = np.array(np.meshgrid(steps, steps, steps)).reshape(3, -1).T
-    radii = hull.radii(grid)
-    assert more[0, 3] == pytest.approx(radii.max())
-    for k in range(1, 9):
-        apart = np.linalg.norm(grid[:, None] - more[:k, :3], axis=2) - more[:k, 3]
-        reach = np.where(radii > 0.0, apart.min(axis=1) + radii, -np.inf)
-        own = np.linalg.norm(more[k, :3] - more[:k, :3], axis=1) - more[:k, 3]
-        assert own.min() + more[k, 3] == pytest.approx(reach.max(), abs=1e-6)
-    everything = hull.spread_balls(10_000, points_per_side=5)
-    inside = hull.radii(0.2 * np.array(np.meshgrid(*[np.linspace(-1, 1, 5)] * 3)).reshape(3, -1).T)
-    assert len(everything) == np.count_nonzero(inside)
-
-
-def test_empty_surface_has_no_balls():
-    empty = VisualHull(outline_from_mesh(TriangleMesh.empty()))
-    assert empty.spread_balls(5).shape == (0, 4)
-    assert empty.radii(np.zeros((2, 3))).tolist() == [0.0, 0.0]
 
 
 @pytest.mark.parametrize("camera", CAMERAS, ids=lambda camera: camera.name)

@@ -91,7 +91,6 @@ def grow(
     node: int,
     width: int,
     outside_weight: int,
-    spare: int = 4,
 ) -> PartialPoses | None:
     """Place one more node in every partial pose and keep the best results.
 
@@ -102,7 +101,6 @@ def grow(
         node: index of the node that is placed.
         width: beam width: greatest number of partial poses that are kept.
         outside_weight: cost of a pixel outside, relative to the gain of a newly covered one.
-        spare: number of candidates from which distinct ones are chosen, as a multiple of ``width``.
 
     Returns the new partial poses, best first; None if there is none.
     """
@@ -118,8 +116,8 @@ def grow(
         return None
     outside = partial.outside[pairs[:, 0]] + areas[:, 1] + store.nodes[node].areas[pairs[:, 1], 2]
     costs = outside_weight * outside - partial.covered[pairs[:, 0]] - areas[:, 0]
-    # The smallest costs; equal costs keep their order.
-    most = min(spare * width, len(costs))
+    # The smallest costs, from which distinct ones are chosen; equal costs keep their order.
+    most = min(4 * width, len(costs))
     best = np.flatnonzero(costs <= np.partition(costs, most - 1)[most - 1])
     best = best[np.argsort(costs[best], kind="stable")[:most]]
     pairs, scores = pairs[best], (areas[best], added[best])

@@ -144,8 +144,6 @@ def test_pose_is_recovered_from_drakes_masks(person, fit):
     tiles = fit.tile_costs(views, found.values, STEPS[-1], 20.0)
     sums = fit.compare(views, found.values, STEPS[-1]).sums
     np.testing.assert_allclose(tiles.sum(axis=(1, 2)), sums[:, :, Sum.COST].sum(axis=1))
-    assert (tiles[:, 12:] == 0.0).all()
-    assert (tiles[:, :, 16:] == 0.0).all()
     assert 5 < np.count_nonzero(tiles[0]) < 100
 
 

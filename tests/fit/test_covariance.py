@@ -98,24 +98,6 @@ def test_covariance_matches_monte_carlo():
     assert np.mean(ratios) == pytest.approx(3.0, rel=0.15)
 
 
-@pytest.mark.parametrize("size", [0.0, 1.0, 5.0])
-def test_nuisances_widen_the_intervals_of_dependent_values(size):
-    """Intervals of values fitted without nuisances have the claimed coverage, for any size."""
-    generator, inside, widths = np.random.default_rng(4), [], []
-    for _ in range(12):
-        sizes = ErrorSizes(1.0, 0.0, 0.1, 0.1, 0.1, (size,))
-        residuals, errors = drawn_distances(generator, sizes, 60)
-        found = estimate_sizes(residuals, ANGLES, 0.0, 3.0)
-        by_nuisances, _, without = nuisance_covariance(residuals, found, ANGLES)
-        own = values_covariance(without, found, ALL, ANGLES)
-        deviations = np.sqrt(np.diag(own + by_nuisances))
-        inside += (np.abs(errors) < 1.96 * deviations).tolist()
-        widths.append(np.median(deviations) / np.median(np.abs(errors)))
-    assert np.mean(inside) >= 0.85
-    # The intervals are not trivially wide: a typical error is about one deviation.
-    assert np.median(widths) < 4.0
-
-
 def test_unobservable_values_have_the_prior_deviation(capfd):
     empty = Distances(
         np.zeros(0),

@@ -9,7 +9,6 @@ from drake_pose.fit import surfaces
 from drake_pose.fit.surfaces import (
     FEW,
     VERY_FEW,
-    collapse_edges,
     load_or_make,
     reduce_meshes,
     simplify_or_hull,
@@ -20,7 +19,6 @@ from drake_pose.fit.surfaces import (
     with_radius_scales,
 )
 from drake_pose.silhouette.outline import TreeSurfaces, outline_from_mesh
-from drake_pose.workers import map_ordered
 
 RADIUS, TUBE, ENDS = 0.08, 0.06, (0.1, 0.3)
 
@@ -101,13 +99,6 @@ def test_surface_distance_matches_brute_force():
     assert surface_distance(other, other) == pytest.approx(0.0, abs=1e-9)
 
 
-def test_simplification_is_thread_safe():
-    balls = [outline_from_mesh(ball(4, 0.1 + 0.01 * k)) for k in range(6)]
-    together = map_ordered(lambda one: collapse_edges(one, FEW), balls, 4)
-    for given, one in zip(balls, together, strict=True):
-        np.testing.assert_array_equal(collapse_edges(given, FEW).vertices, one.vertices)
-
-
 def test_radius_scales_widen_across_the_y_axis():
     given = [outline_from_mesh(ball(1, 0.1)), outline_from_mesh(ball(0, 0.2))]
     for one, factor, wide in zip(given, (2.0, 1.0), with_radius_scales(given, [2.0, 1.0]),
@@ -140,11 +131,6 @@ def same(one, other):
         np.array_equal(getattr(one, name), getattr(other, name))
         for name in ("vertices", "triangles", "edges")
     )
-
-
-def test_simplified_surfaces_are_stored(folder):
-    simplify_surfaces(Rigid(outline_from_mesh(ball(4, 0.0817))))
-    assert len(list(folder.iterdir())) == 1
 
 
 @pytest.mark.parametrize(

@@ -8,12 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from drake_pose.camera.models import PinholeCamera
-from drake_pose.registration.camera_motion import (
-    BackgroundTracker,
-    PictureMotion,
-    find_camera_motion,
-    find_steps,
-)
+from drake_pose.registration.camera_motion import PictureMotion, find_camera_motion, find_steps
 
 WIDTH, HEIGHT, FOCAL, COUNT = 320, 240, 300.0, 40
 CAMERA = PinholeCamera("eye", WIDTH, HEIGHT, FOCAL, FOCAL, 159.5, 119.5, np.eye(4))
@@ -86,19 +81,6 @@ def test_a_camera_that_stands_still_has_no_motion(seed: int) -> None:
     assert motion.found_again > 0.3  # 0.13 at most, where the camera rides on the robot.
 
 
-def test_two_nudges_of_which_the_second_undoes_the_first() -> None:
-    R = turn((1.0, 1.0, 0.0), 5.0)
-    motion = told(lambda k: R if 12 <= k < 27 else STILL, 20)
-    assert [one[:2] for one in motion.nudges] == [(11, 12), (26, 27)]
-    one, other = (nudge.rotation for nudge in motion.nudges)
-    np.testing.assert_allclose(one, -other, atol=0.3 / FOCAL)
-
-
-def test_pictures_taken_during_a_nudge_belong_to_no_part() -> None:
-    (nudge,) = told(lambda k: turn((0.0, 1.0, 0.0), 3.0 * np.clip(k - 14, 0, 3)), 21).nudges
-    assert (nudge.before, nudge.after) == (14, 17)
-
-
 def test_drift_and_shake_are_no_nudges() -> None:
     drifts = told(lambda k: turn((1.0, 0.2, 0.0), 4.0 * k / COUNT), 22)
     assert drifts.nudges == ()
@@ -144,28 +126,3 @@ def steps_of(levels: list[float], counts: list[int], noise: float, seed: int = 1
 )  # fmt: skip
 def test_steps_are_found_between_their_samples(levels, counts, noise, found) -> None:
     assert find_steps(steps_of(levels, counts, noise), 0.5) == found
-
-
-def test_a_background_shift_has_four_parts_in_tracked_pixels() -> None:
-    """The centre's motion, and rotation and growth times a picture's root mean square radius."""
-    wall = patched(7, (640, 480), (8, 30, 80))
-    camera = PinholeCamera("eye", 1280, 960, 1200.0, 1200.0, 639.5, 479.5, np.eye(4))
-    wall = cv2.resize(wall, (1280, 960), interpolation=cv2.INTER_CUBIC)
-    radius = np.hypot(640, 480) / np.sqrt(12.0)
-    cases = [(0, 0, 0.0, 1.0), (6, -4, 0.0, 1.0), (0, 0, 0.02, 1.0), (3, 2, -0.01, 1.01)]
-    views = []
-    for u, v, angle, grow in cases:
-        moved = cv2.getRotationMatrix2D((639.5, 479.5), -np.degrees(angle), grow)
-        moved[:, 2] += u, v
-        view = cv2.warpAffine(wall, moved, (1280, 960), borderMode=cv2.BORDER_REFLECT)
-        views.append(view.clip(0, 255).astype(np.uint8))
-    tracker = BackgroundTracker(lambda k: views[k], 0, camera)
-    assert tracker.scale == 0.5
-    found = tracker.shifts(range(len(cases)))
-    for shift, (u, v, angle, grow) in zip(found, cases, strict=True):
-        expected = [0.5 * u, 0.5 * v, radius * angle, radius * (grow - 1.0)]
-        np.testing.assert_allclose(shift[:4], expected, atol=0.12)
-    turn_of = tracker.rotation(np.array([3.0, -2.0, 5.0, 9.0]))
-    np.testing.assert_allclose(turn_of, [2.0 / 600.0, 3.0 / 600.0, 5.0 / radius])
-    blank = BackgroundTracker(lambda _: np.full((960, 1280, 3), 90, np.uint8), 0, camera)
-    assert np.isnan(blank.shifts([0])[:, :4]).all()

@@ -405,17 +405,6 @@ def test_camera_is_found_without_initial_guess_within_its_deviations(episode, re
     assert offsets[scores.argmax()] == pytest.approx(LATE, abs=0.03)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("said", ["its pictures are mirrored", "no pose explains its pictures"])
-def test_mirrored_pictures_and_joints_of_another_episode_are_refused(episode, recording, said):
-    if "mirrored" in said:
-        wrong = recording(read=lambda k: np.ascontiguousarray(episode.pictures[k][:, ::-1]))
-    else:
-        wrong = recording(values_at=lambda offset: -0.7 * episode.values_at(2.0 * episode.times))
-    with pytest.raises(RegistrationError, match=said):
-        register_pictures(episode.body, episode.camera, wrong)
-
-
 def test_the_margin_of_inlier_ratios_holds_its_level():
     """Over pairs of equally good poses, whose frames differ more from each other than the poses."""
     rng = np.random.default_rng(5)

@@ -13,25 +13,14 @@ from tests.registration.arm_pictures import MIDDLE, PLACE, errors, looking_at, s
 
 
 class TestCameraSearch:
-    @pytest.mark.parametrize(
-        ("place", "roll"),
-        [
-            # Below and upside down; beside; above and turned.
-            ((-0.9, 1.0, -0.6), 3.1),
-            pytest.param((1.6, 0.4, 0.5), 0.1, marks=pytest.mark.slow),
-            pytest.param((0.5, -0.6, 1.7), 2.0, marks=pytest.mark.slow),
-        ],
-    )
-    def test_finds_a_camera_anywhere(self, model, body, place, roll):
-        camera = looking_at(np.array(place), MIDDLE, roll)
-        found = CameraSearch(body).register(
-            camera.with_pose(np.eye(4)), see(model, body, camera, 5, 1)
-        )
+    def test_finds_a_camera_below_the_arm_and_upside_down(self, model, body):
+        camera = looking_at(np.array([-0.9, 1.0, -0.6]), MIDDLE, 3.1)
+        frames = see(model, body, camera, 5, 1)
+        found = CameraSearch(body).register(camera.with_pose(np.eye(4)), frames)
         shift, turn = errors(found.camera.X_WC, camera.X_WC)
         assert shift < 2e-3
         assert turn < np.radians(0.1)
-        assert not found.outliers
-        assert not len(found.alternatives)
+        assert (found.outliers, len(found.alternatives)) == ((), 0)
         own = replace(found, covariance=found.covariance - found.common)
         assert shift < 4.0 * np.sqrt(3.0) * own.translation_sd < 0.01
         # All that is seen of this arm turns with its first joint.

@@ -90,8 +90,8 @@ def test_evidence_needs_enough_frames_and_a_gain():
     worse = paired_evidence(agreement(rows, rows) - 31.0, rows)
     assert (worse.p_value <= LEVEL, worse.holds) == (True, False)
     assert "without the body" in str(worse)
-    for nothing in (np.ones((1, 1)), np.zeros((12, 12))):
-        assert paired_evidence(nothing, rows[: len(nothing)]).p_value == 1.0
+    for gains in (np.ones((1, 1)), np.zeros((12, 12))):
+        assert paired_evidence(gains, rows[: len(gains)]).p_value == 1.0
 
 
 def test_gains_count_the_pixels_of_each_row():

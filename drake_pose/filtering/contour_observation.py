@@ -178,11 +178,9 @@ class ContourObservation:
             raise SettingsError(f"{tree.model.path}: its pose tree has no free value")
         self._root_moves = root_moves
         known = [*self._kinematics.names, *_ROOT]
-        self._element_names = [*self.layout.moving]
-        self._state_index = self.layout.indices(self._element_names)
-        self._parameter_index = np.array(
-            [known.index(name) for name in self._element_names], np.intp
-        )
+        self._moving = slice(len(self.layout.moving))
+        index = [known.index(name) for name in self.layout.moving]
+        self._parameter_index = np.array(index, np.intp)
         self._values = self._kinematics.flatten(tree.default_values())
         self._known_shift = np.zeros(3)
         self.prior = self._joint_prior()
@@ -200,7 +198,7 @@ class ContourObservation:
         if self.tree.placements[0].rotation is not None:
             # The root's rotation is not a joint.
             limited &= kinematics.value_nodes > 0
-        names, index = self._element_names, self._parameter_index
+        names, index = self.layout.moving, self._parameter_index
         file = couplings_file(self.tree.model.path)
         listed = JointPrior(np.zeros((0, len(names))), np.zeros(0), np.zeros(0))
         if file.is_file():
@@ -228,7 +226,7 @@ class ContourObservation:
 
         Raises ModelError: the couplings file cannot be read.
         """
-        kinematics, names, model = self._kinematics, self._element_names, self.tree.model
+        kinematics, names, model = self._kinematics, self.layout.moving, self.tree.model
         lower, upper = (
             np.r_[limits, np.full(len(_ROOT), end)][self._parameter_index]
             for end, limits in ((-np.inf, kinematics.lower), (np.inf, kinematics.upper))
@@ -266,7 +264,7 @@ class ContourObservation:
     def _split(self, x: Array) -> tuple[Array, Array]:
         """Return the tree's values (m,), and root shift and log scale (4,), of a state (n,)."""
         parameters = np.r_[self._values, np.zeros(len(_ROOT))]
-        parameters[self._parameter_index] = x[self._state_index]
+        parameters[self._parameter_index] = x[self._moving]
         count = len(self._values)
         parameters[count : count + 3] += self._known_shift
         return parameters[:count], parameters[count:]
@@ -323,12 +321,12 @@ class ContourObservation:
         R_WR = rotation @ self._kinematics.poses(self._split(x)[0])[0, :3, :3]
         parameters[:3] = placed.rotation.values_from(placed.X_PA[:3, :3].T @ R_WR)
         turned = x.copy()
-        turned[self._state_index] = self.state_of(parameters)[self._state_index]
+        turned[self._moving] = self.state_of(parameters)[self._moving]
         return turned
 
     def prior_distance(self, x: Array) -> float:
         """Return the squared Mahalanobis distance of a state (n,) from the joints' prior."""
-        off = self.prior.phi @ x[self._state_index] - self.prior.mean
+        off = self.prior.phi @ x[self._moving] - self.prior.mean
         return float(np.sum((off / self.prior.deviation) ** 2))
 
     def unwrapped(self, x: Array, last: Array) -> Array:
@@ -336,7 +334,7 @@ class ContourObservation:
         values = self._split(x)[0]
         turns = self._kinematics.nearest_turns(values, self._split(last)[0]) - values
         turned = x.copy()
-        turned[self._state_index] += np.r_[turns, np.zeros(len(_ROOT))][self._parameter_index]
+        turned[self._moving] += np.r_[turns, np.zeros(len(_ROOT))][self._parameter_index]
         return turned
 
     def difference(self, x: Array, views: Iterable[tuple[Camera, Mask]]) -> tuple[int, int]:
@@ -367,7 +365,7 @@ class ContourObservation:
         held = parameters.copy()
         held[len(self._values) : len(self._values) + 3] -= self._known_shift
         x = np.zeros(len(self.layout))
-        x[self._state_index] = held[self._parameter_index]
+        x[self._moving] = held[self._parameter_index]
         return x
 
     def node_poses(self, x: Array) -> Array:
@@ -502,7 +500,7 @@ class ContourObservation:
         # Residuals are computed from both contours, so each gets half of the weight.
         weight = 0.5 / (scale**2 * CONTOUR.correlation)
         prior_curvature, prior_slope = self._prior_information
-        slopes = weight * g[index] + prior_curvature @ x[self._state_index] - prior_slope
+        slopes = weight * g[index] + prior_curvature @ x[self._moving] - prior_slope
         curvature = weight * H[np.ix_(index, index)] + prior_curvature
         size, turns = np.linalg.eigh(curvature)
         # Directions whose information is zero up to rounding are dropped.
@@ -515,7 +513,7 @@ class ContourObservation:
         masked = length[~shown].sum(), off[~shown].sum()
         is_seen = not far.any() and 2.0 * lines[Sum.FITTING] >= lines[Sum.COMPARED]
         slope = np.zeros((len(root), len(self.layout)))
-        slope[:, self._state_index] = root[:, None] * turns.T
+        slope[:, self._moving] = root[:, None] * turns.T
         return ContourMeasurement(
             names=tuple(f"contour_{k}" for k in range(len(root))),
             variances=np.ones(len(root)),
@@ -580,7 +578,7 @@ class ContourObservation:
         """
         unit = error_unit(math.sqrt(area / len(self.cameras)))
         index, size = self._parameter_index, len(self._body.names)
-        is_angle = np.array([self.is_angle(name) for name in self._element_names])
+        is_angle = np.array([self.is_angle(name) for name in self.layout.moving])
         moves = measured.compared.placement.dense(size)[:, index]
         cameras = pack_cameras(self.cameras)
         errors = distances(self._body.outlines, cameras, measured.compared, moves, unit)
@@ -590,5 +588,5 @@ class ContourObservation:
             errors, sizes, np.arange(len(index)), is_angle
         )
         if spread is not None:
-            covariance[index, index] += spread[self._state_index] ** 2
+            covariance[index, index] += spread[self._moving] ** 2
         return covariance[:count, :count]

@@ -30,6 +30,11 @@ PALM_EDGES = ("left", "right", "top", "bottom")
 _FROM_LINK = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
 
 
+# Number of points of a palm's outline. That at the wrist is of the vertices up to the first height,
+# that at the knuckles of those between the next two, at the third [fractions of the palm's height].
+_POINTS, _WRIST, _KNUCKLES = 16, 0.07, (0.78, 0.84, 0.85)
+
+
 class Chains(NamedTuple):
     """A hand as arrays for ``project_hand``; elements are indices into ``HandModel.visible``."""
 
@@ -299,23 +304,18 @@ def _palm_rings(
     model: ArticulatedModel,
     palm: str,
     height: float,
-    count: int = 16,
-    wrist: float = 0.07,
-    knuckles: tuple[float, float, float] = (0.78, 0.84, 0.85),
 ) -> Array:
-    """Return a palm's outlines (2, count, 3) [m] at wrist and knuckles, in the palm's frame.
+    """Return a palm's outlines (2, _POINTS, 3) [m] at wrist and knuckles, in the palm's frame.
 
     ``model``: the hand. ``palm``: name of the palm's link. ``height``: height of the palm [m].
-    ``count``: number of points of an outline. ``wrist``: the wrist's outline is that of the
-    vertices up to this height. ``knuckles``: the other outline is that of the vertices between the
-    first two heights, placed at the third. All heights are fractions of ``height``.
     """
     low = float(model.link_meshes[palm].vertices[:, 1].min())
-    angles = 2.0 * np.pi * np.arange(count) / count
+    angles = 2.0 * np.pi * np.arange(_POINTS) / _POINTS
     directions = np.column_stack([np.cos(angles), np.sin(angles)])
-    bands = ((low, low + wrist * height), [fraction * height for fraction in knuckles[:2]])
-    rings = np.zeros((2, count, 3))
-    for ring, (begin, end), x in zip(rings, bands, (low, knuckles[2] * height), strict=True):
+    first, last, place = (fraction * height for fraction in _KNUCKLES)
+    bands = ((low, low + _WRIST * height), (first, last))
+    rings = np.zeros((2, len(angles), 3))
+    for ring, (begin, end), x in zip(rings, bands, (low, place), strict=True):
         band = _band(model, palm, begin, end) @ _FROM_LINK.T
         ring[:] = band[np.argmax(band[:, 1:] @ directions.T, axis=0)]
         ring[:, 0] = x

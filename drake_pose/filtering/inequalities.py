@@ -6,7 +6,7 @@ of the joints.
 
 import math
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -34,12 +34,6 @@ class Inequalities:
     def margins(self, x: ArrayLike) -> Array:
         """Return b - phi x (K,) at x (n,): negative where an inequality is violated."""
         return self.b - self.phi @ np.asarray(x, dtype=np.float64)
-
-    def take(self, indices: Iterable[int]) -> "Inequalities":
-        """Return the inequalities of these indices, in this order."""
-        chosen = list(indices)
-        rows = [self.rows[index] for index in chosen]
-        return make_inequalities(self.columns, rows, self.phi[chosen], self.b[chosen])
 
     def for_columns(self, columns: Sequence[str]) -> "Inequalities":
         """Return the same inequalities over other columns, for example with rates added.

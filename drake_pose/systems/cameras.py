@@ -178,7 +178,6 @@ class CameraRig:
 
     diagram: Diagram  # The diagram.
     cameras: Mapping[str, PinholeCamera]  # The cameras by name.
-    sensors: Mapping[str, RgbdSensor]  # The simulated cameras in the diagram, by name.
 
     def set_positions(self, context: Context, q: Array) -> None:
         """Fix the body's positions q (nq,) [rad or m] in a context of the diagram."""
@@ -234,7 +233,7 @@ def build_camera_rig(
     for name, sensor in sensors.items():
         builder.ExportOutput(sensor.color_image_output_port(), f"color_image_{name}")
         builder.ExportOutput(sensor.label_image_output_port(), f"label_image_{name}")
-    return CameraRig(builder.Build(), dict(cameras), sensors)
+    return CameraRig(builder.Build(), dict(cameras))
 
 
 def add_sensors(

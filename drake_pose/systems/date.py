@@ -51,6 +51,9 @@ from drake_pose.systems.ports import (
     require_period,
 )
 
+FARTHEST_FACE = 30.0
+"""Largest distance of a face from the eigenspace [grey levels]."""
+
 
 @dataclass(frozen=True, eq=False)
 class CaptureSetup:
@@ -73,7 +76,6 @@ class CaptureSetup:
     search: bool = True
     # Smallest similarity at which the registered pose replaces the state.
     recognition: float = 0.93
-    farthest_face: float = 30.0  # Largest distance of a face from the eigenspace [grey levels].
 
     def __post_init__(self) -> None:
         if len(self.cameras) < 2:
@@ -275,11 +277,10 @@ class FaceDirectionFinder(PortedSystem):
         face_direction (2): turn to the person's left and nod downwards, relative to facing the
             camera [rad]; NaN if no face is visible or an input is missing.
 
-    ``templates``: templates of the person's face. ``farthest``: largest distance of a face from the
-    eigenspace [grey levels].
+    ``templates``: templates of the person's face.
     """
 
-    def __init__(self, camera: Camera, templates: FaceTemplates, farthest: float) -> None:
+    def __init__(self, camera: Camera, templates: FaceTemplates) -> None:
         super().__init__()
         self.add_input("color_image", ImageRgba8U(camera.width, camera.height))
         self.add_input("person_view", None)
@@ -288,7 +289,7 @@ class FaceDirectionFinder(PortedSystem):
             image, view = (self.eval_input(context, k) for k in ("color_image", "person_view"))
             if image is None or not image.size() or view is None:
                 return np.full(2, np.nan)
-            return find_face(colour_image_to_picture(image), view.blobs, templates, farthest)
+            return find_face(colour_image_to_picture(image), view.blobs, templates, FARTHEST_FACE)
 
         self.add_output("face_direction", 2, find)
 
@@ -475,7 +476,7 @@ def build_paper_capture(
         parts["recognition"] = recogniser, ("recognised_positions", "similarity")
     parts["features"] = FeatureFinder(cameras), ("features",)
     if face is not None and setup.faces is not None:
-        finder = FaceDirectionFinder(face, setup.faces, setup.farthest_face)
+        finder = FaceDirectionFinder(face, setup.faces)
         parts["face"] = finder, ("face_direction",)
     estimator = PaperPoseEstimator(setup, period)
     for stage, (system, results) in {**parts, "pose": (estimator, ())}.items():

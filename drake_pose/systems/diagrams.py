@@ -41,6 +41,9 @@ from drake_pose.systems.silhouette_matcher import SilhouetteMatcher, SilhouetteT
 REGISTRATION = ("keyframes", "outliers", "moves", "mean_iou")
 """Names of the elements of the output port ``registration`` of CameraRegistration."""
 
+# Largest fraction of the image that a body may cover.
+_MAX_COVERAGE = 0.6
+
 
 class CameraRegistration(BeliefSystem[OnlineState]):
     """Finds a camera's pose from a body at measured positions, and detects its displacement.
@@ -77,19 +80,16 @@ class CameraRegistration(BeliefSystem[OnlineState]):
             union of body and mask over the kept frames, NaN before the camera is found.
 
     ``registration``: the method, with the body, and the camera with its intrinsics. ``period``:
-    time between two updates [s]. ``max_coverage``: largest fraction of the image that the body may
-    cover.
+    time between two updates [s].
 
     Raises SettingsError: the period is not positive; MaskError: in a simulation, if the body's
-    labels cover more of the image.
+    labels cover more than 60 % of the image.
     """
 
-    def __init__(
-        self, registration: OnlineRegistration, period: float, max_coverage: float = 0.6
-    ) -> None:
+    def __init__(self, registration: OnlineRegistration, period: float) -> None:
         super().__init__()
         require_period("registration", period)
-        self._registration, self._max_coverage = registration, max_coverage
+        self._registration = registration
         self._tree, camera = registration.body.tree, registration.camera
         self.add_input("label_image", ImageLabel16I(camera.width, camera.height))
         self.add_input("measured_positions", len(self._tree.model.position_names))
@@ -118,10 +118,10 @@ class CameraRegistration(BeliefSystem[OnlineState]):
         values = np.concatenate(self._tree.values_from_positions(q))
         mask = label_image_to_mask(image, self._tree.model.labels)
         covered = float(mask.mean())
-        if covered > self._max_coverage:
+        if covered > _MAX_COVERAGE:
             raise MaskError(
                 f"{self.get_name()}: labels of the body cover {covered:.0%} of the image of "
-                f"camera '{self._registration.camera.name}' ({self._max_coverage:.0%} at most); "
+                f"camera '{self._registration.camera.name}' ({_MAX_COVERAGE:.0%} at most); "
                 "they may include the ground; use a model from ArticulatedModel.from_plant, which "
                 "has the body's own labels"
             )

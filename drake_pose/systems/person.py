@@ -46,6 +46,12 @@ from drake_pose.systems.ports import (
     require_period,
 )
 
+# Number of frames for which others are looked for after they were visible; this is slow.
+_WATCHED_FRAMES = 15
+
+# Larger turns of a face between two frames are errors [rad].
+_AROUND = math.radians(100.0)
+
 
 class PersonTracker(MemorySystem):
     """Tracks a person in the pictures of several cameras.
@@ -84,8 +90,6 @@ class PersonTracker(MemorySystem):
         cameras: calibrated, in the order of the input ports, or by name.
         period: time between two updates [s].
         with_deviations: whether there is an output port ``deviations``.
-        watch_frames: number of frames for which others are looked for after they were visible; this
-            is slow.
 
     Raises:
         SettingsError: there are fewer than two cameras, two have the same name, or the period is
@@ -98,14 +102,13 @@ class PersonTracker(MemorySystem):
         cameras: Sequence[Camera] | Mapping[str, Camera],
         period: float,
         with_deviations: bool = False,
-        watch_frames: int = 15,
     ) -> None:
         super().__init__()
         cameras = camera_tuple(cameras)
         require_distinct_cameras(cameras, 2, "a person is tracked by two or more different cameras")
         require_period("tracker", period)
         self._tracker, self._cameras, self._period = tracker, cameras, period
-        self._with_deviations, self._watch_frames = with_deviations, watch_frames
+        self._with_deviations = with_deviations
         self._views = self.add_camera_inputs({c.name: f"silhouette_{c.name}" for c in cameras})
         self.add_input("time", 1)
         model = tracker.fit.tree.model
@@ -179,7 +182,7 @@ class PersonTracker(MemorySystem):
             fit, step = self._tracker.fit, self._tracker.settings.follow[-1]
             sums = clean.compare(fit, fit.body.place(found.values), step).sums
             found = replace(found, inlier_ratio=inlier_ratio_of(sums))
-        watched = self._watch_frames if separated.others else max(known["watched"][0] - 1.0, 0.0)
+        watched = _WATCHED_FRAMES if separated.others else max(known["watched"][0] - 1.0, 0.0)
         changed |= {"watched": np.array([watched])} | self._packed(found)
         if not found.is_lost:
             changed["last_positions"] = self._tracker.positions(found.values)
@@ -440,14 +443,11 @@ class Walker(MemorySystem):
         )
         return known
 
-    def _recognise(
-        self, q: Array, known: dict[str, Array], around: float = math.radians(100.0)
-    ) -> tuple[int, int]:
+    def _recognise(self, q: Array, known: dict[str, Array]) -> tuple[int, int]:
         """Return the command (turn, walk), each -1, 0 or 1, of a visible person; update ``known``.
 
         ``q``: (nq,) the person's positions [rad or m]. ``known``: state vectors by name; the
-        person's stance and steps are overwritten. ``around``: larger turns of the face between two
-        frames are errors [rad].
+        person's stance and steps are overwritten.
         """
         self._plant.SetPositions(self._plant_context, q)
         X_WH, *X_WF = [part.EvalPoseInWorld(self._plant_context) for part in self._parts]
@@ -455,7 +455,7 @@ class Walker(MemorySystem):
         stance = stance_of(X_WH.rotation().col(0), X_WH.translation(), feet)
         turned = math.remainder(stance[0] - known["heading"][0], 2.0 * math.pi)
         known["heading"] = stance[:1]
-        if abs(turned) > around:
+        if abs(turned) > _AROUND:
             known["rest"][0] += turned
         if not np.isfinite(known["rest"]).all():
             known["rest"] = stance

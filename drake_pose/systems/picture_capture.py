@@ -22,6 +22,12 @@ from drake_pose.silhouette.segmentation import Background, person_region
 from drake_pose.systems.cameras import colour_image_to_picture, fill_colour_image
 from drake_pose.systems.ports import PortedSystem, require_period
 
+# Longest time to wait for the first pictures of live cameras [s].
+_OPENING_TIMEOUT = 8.0
+
+# Number of a recorded camera's pictures that wait for other cameras at most.
+_AHEAD = 8
+
 
 class Synchroniser:
     """Groups the pictures of several cameras into synchronised frames.
@@ -135,7 +141,6 @@ class PictureCapture(PortedSystem):
         sources: opened sources of pictures, by name of the camera.
         cameras: cameras by name, which give the sizes of the images.
         clock: returns the computer's time [s]; that of the live sources.
-        opening_timeout: longest time to wait for the first pictures of live cameras [s].
 
     Attributes:
         period: time between two updates, that of the fastest source [s].
@@ -154,7 +159,6 @@ class PictureCapture(PortedSystem):
         cameras: Mapping[str, Camera],
         *,
         clock: Callable[[], float] = time.monotonic,
-        opening_timeout: float = 8.0,
     ) -> None:
         super().__init__()
         require_known("camera", sources, cameras, "the calibration")
@@ -167,7 +171,7 @@ class PictureCapture(PortedSystem):
         require_period("capture", self.period)
         tolerance = (0.9 if self.live else 0.5) * self.period
         self._synchroniser = Synchroniser(self._sources, tolerance, timeout=4.0 * self.period)
-        self._clock, self._opening_timeout = clock, opening_timeout
+        self._clock = clock
         self._since: float | None = None
         self._opened: set[str] = set()
         self._begin: float | None = None
@@ -280,7 +284,7 @@ class PictureCapture(PortedSystem):
                 self._opened.add(name)
         now = self._clock()
         self._since = now if self._since is None else self._since
-        if len(self._opened) < len(self._sources) and now - self._since < self._opening_timeout:
+        if len(self._opened) < len(self._sources) and now - self._since < _OPENING_TIMEOUT:
             return None
         for name in recorded:
             self._pending[name] = self._sources[name].read()
@@ -289,12 +293,12 @@ class PictureCapture(PortedSystem):
         self._origins = {name: first if name in recorded else begin for name in self._sources}
         return begin
 
-    def _feed(self, name: str, source: FrameSource, now: float, ahead: int = 8) -> None:
+    def _feed(self, name: str, source: FrameSource, now: float) -> None:
         """Pass new pictures of a source to the synchroniser, or tell it that the source has ended.
 
         A live source gives its newest picture, if it is new. A recorded one gives all pictures that
         are due at ``now`` [s]; the next one is kept until it is due. In a capture that is not live,
-        reading stops while ``ahead`` pictures of the camera ``name`` wait for other cameras.
+        reading stops while _AHEAD pictures of the camera ``name`` wait for other cameras.
         """
         origin, synchroniser = self._origins[name], self._synchroniser
         if source.specification.live:
@@ -304,7 +308,7 @@ class PictureCapture(PortedSystem):
             elif source.ended:
                 synchroniser.finish(name)
             return
-        while self.live or synchroniser.waiting(name) < ahead:
+        while self.live or synchroniser.waiting(name) < _AHEAD:
             one = self._pending[name]
             if one is None:
                 one = self._pending[name] = source.read()

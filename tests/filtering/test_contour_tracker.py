@@ -63,7 +63,6 @@ def test_tracked_after_one_match_and_matched_again_after_a_jump(body, renderer):
     assert asked[0] == asked[11] == 1
     assert asked[12] == 2
     assert asked[-1] <= 3
-    # Segments have 12 to 24 pixels.
     assert np.median(errors[:12]) < 3.0
     assert np.median(errors[12:]) < 3.5
     assert result.stopped_by == TRACKED
@@ -265,7 +264,6 @@ def test_a_drifting_scale_is_tracked_and_found_again_after_a_cut(tree):
     assert search.calls == 2
     assert kinds[-1] == TRACKED
     np.testing.assert_allclose(scales, 1.0, atol=0.05)
-    # Segments have 12 to 24 pixels.
     assert np.median(errors) < 4.0
     assert max(errors) < 8.0
 

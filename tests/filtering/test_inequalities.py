@@ -94,7 +94,6 @@ def test_rows_for_other_columns():
     larger = rows.for_columns(["rate", "b", "a"])
     np.testing.assert_allclose(larger.margins([99, 1.5, 0.5]), rows.margins([0.5, 1.5]))
     assert rows.restricted_to(["b", "c"]).rows == ("b >= 1", "b <= 3")
-    assert rows.take([3, 0]).rows == ("b <= 3", "a >= 0")
     both = stack([rows, from_bounds(["c"], [-1], [np.inf])])
     assert (both.columns, both.rows[4:]) == (("a", "b", "c"), ("c >= -1",))
     assert len(stack([], ["a"])) == 0

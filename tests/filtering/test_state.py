@@ -106,7 +106,10 @@ def test_linearise_over_has_the_exact_moments_of_quadratics(has_jacobian):
 def test_linearise_over_keeps_the_tangent_where_it_cannot_see(has_jacobian):
     """Without variance, where a value is NaN at a sigma point, and over a full turn."""
 
+    called = []
+
     def function(x):
+        called.append(x)
         seen = np.array([np.sin(x[0]), np.nan if x[0] > 0.4 else x[0] * x[1], np.pi - 0.1 * x[0]])
         slope = np.array([[np.cos(x[0]), 0.0], [x[1], x[0]], [-0.1, 0.0]])
         seen[2] = np.remainder(seen[2] + np.pi, 2.0 * np.pi) - np.pi
@@ -115,6 +118,8 @@ def test_linearise_over_keeps_the_tangent_where_it_cannot_see(has_jacobian):
     at = Belief(np.array([0.1, 3.0]), np.diag([0.04, 0.0]))
     values = None if has_jacobian else lambda x: function(x)[0]
     line = linearise_over(function, at, np.array([False, False, True]), values)
+    # Steps that change no value need no second derivatives, here the Jacobian at the mean.
+    assert len(called) == (5 if has_jacobian else 6)
     end = np.sqrt(3.0) * 0.2
     secant = (np.sin(0.1 + end) - np.sin(0.1 - end)) / (2.0 * end)
     np.testing.assert_allclose(line.slope, [[secant, 0.0], [3.0, 0.1], [-0.1, 0.0]], atol=1e-9)

@@ -232,7 +232,7 @@ def test_persistence_counts_the_linearisation_error_for_as_many_frames():
         f = make_filter(motion=motion, persistence=persistence, hypothesis_cap=1)
         return f.update(f.start(wide), y).best.covariance[2, 2]
 
-    assert variance(0.0) == variance(0.1) < variance(0.4) < variance(1.0)
+    assert variance(0.0) == variance(0.1) < variance(0.2) < variance(0.4)
     assert variance(4 / 30, None) == pytest.approx(variance(0.4))
 
 
@@ -281,7 +281,7 @@ def scaled(one, size, common):
     return replace(one, belief=belief, free=belief, **logs)
 
 
-@pytest.mark.parametrize(("size", "common"), [(1.0, 0.0), (1e-3, -800.0), (9.0, 800.0)])
+@pytest.mark.parametrize(("size", "common"), [(1.0, 0.0), (1e-7, -800.0), (9.0, 800.0)])
 def test_mixtures_are_reduced_by_the_cheapest_mergers(size, common):
     """Compared with brute force; moments and weights are kept, at any scale of the state."""
     for seed in range(4):

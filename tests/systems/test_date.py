@@ -20,6 +20,7 @@ from drake_pose.silhouette.pictures.label_renderer import mask_to_label_image
 from drake_pose.silhouette.segmentation import person_region
 from drake_pose.systems.cameras import build_camera_rig, picture_to_colour_image
 from drake_pose.systems.date import (
+    FARTHEST_FACE,
     CaptureSetup,
     FeatureFinder,
     HorizontalImage,
@@ -84,7 +85,7 @@ class Core:
         self.features = find_features(cameras, seen, self.features).positions
         if FACE_CAMERA in views:
             blobs = views[FACE_CAMERA].blobs
-            direction = find_face(pictures[FACE_CAMERA], blobs, own.faces, own.farthest_face)
+            direction = find_face(pictures[FACE_CAMERA], blobs, own.faces, FARTHEST_FACE)
             if np.isfinite(direction).all():
                 face = head_angles(direction, self.features[0], own.face_camera)
         regions = [view.region for view in seen]

@@ -133,15 +133,13 @@ def test_a_measurement_can_have_its_own_noise(hand):
 def test_a_contexts_parameters_set_the_filter():
     """As in a filter constructed with them; more hypotheses than the ports hold are refused."""
     settings = FilterSettings(linearisation="tangent", iterations=5)
-    run, plain = (Bench(TruncatedEkf(swinging(), ABOUT)) for _ in range(2))
-    other = Bench(TruncatedEkf(swinging(**vars(settings)), ABOUT))
+    run, other = (Bench(TruncatedEkf(swinging(**k), ABOUT)) for k in ({}, vars(settings)))
     run.context.get_mutable_abstract_parameter(0).set_value(settings)
     for t, y in enumerate(([0.5, -0.8], [0.6, -0.7])):
-        for one in (run, other, plain):
+        for one in (run, other):
             one.update(0.1 * t, measurement=y)
     for port in ("estimated_state", "covariance"):
         np.testing.assert_array_equal(run[port], other[port])
-    assert np.abs(run["covariance"] - plain["covariance"]).max() > 1e-6
     # Its patience is set only in the context.
     run.context.get_mutable_numeric_parameter(0).SetFromVector([1.0, 0.5])
     assert statistic(run.update(0.3, measurement=[1.5, 0.2]), "lost") == 1

@@ -23,6 +23,8 @@ class Result:
 
 
 class _Stream(io.StringIO):
+    """Writes to another stream, too."""
+
     def __init__(self, both: io.StringIO) -> None:
         super().__init__()
         self._both = both
@@ -69,12 +71,3 @@ def assert_refused(result: Result, *parts: str, status: int = 1) -> None:
         assert part in message
     assert "Traceback" not in result.output
     assert result.stdout == ""
-
-
-class CliRunner:
-    """Runs commands; the fixture `runner`."""
-
-    def invoke(
-        self, app: object, words: Sequence[str], env: Mapping[str, str] | None = None
-    ) -> Result:
-        return run_command(words, env)

@@ -14,7 +14,6 @@ import pytest
 
 from drake_pose.body import ArticulatedModel, bundled_model, load_model
 from drake_pose.person.date.skeleton import Skeleton, load_skeleton
-from tests.cli import CliRunner
 from tests.jobs.scenes import TinyScene, write_scene
 from tests.person.studio import Studio
 from tests.search.bodies import forked_body
@@ -40,11 +39,6 @@ def own_scene(tiny_scene: TinyScene, tmp_path: Path) -> TinyScene:
     """A copy of tiny_scene that the test may modify."""
     shutil.copytree(tiny_scene.folder, tmp_path / "scene")
     return TinyScene(tmp_path / "scene", tiny_scene.model, tiny_scene.truth)
-
-
-@pytest.fixture(scope="session")
-def runner() -> CliRunner:
-    return CliRunner()
 
 
 @pytest.fixture(scope="session")

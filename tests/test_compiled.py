@@ -1,6 +1,5 @@
 """Kernels are compiled once for all processes, and again if anything they call changes."""
 
-import ast
 import os
 import pickle
 import subprocess
@@ -68,18 +67,12 @@ def test_kernels_are_recompiled_only_when_a_dependency_changes(package: Path) ->
     assert run(package)[0] == [28, 1]
     assert run(package) == ([28, 0], "")
 
-
-def test_unreadable_stored_kernels_are_recompiled(package: Path) -> None:
-    """As if a type of a kernel's arguments had moved to another module."""
-    run(package)
+    # As if a type of a kernel's arguments had moved to another module.
     for index in package.glob("__pycache__/*.nbi"):
-        data = index.read_bytes()
-        first = pickle.loads(data)
-        rest = b"cdrake_pose.moved_away\nThing\n."
-        index.write_bytes(pickle.dumps(first) + rest)
-    values, _ = run(package)
-    assert values == [14, 1]
-    assert run(package)[0] == [14, 0]
+        first = pickle.loads(index.read_bytes())
+        index.write_bytes(pickle.dumps(first) + b"cdrake_pose.moved_away\nThing\n.")
+    assert run(package)[0] == [28, 1]
+    assert run(package)[0] == [28, 0]
 
 
 def test_concurrent_processes_compile_once(package: Path) -> None:
@@ -88,47 +81,18 @@ def test_concurrent_processes_compile_once(package: Path) -> None:
     assert sorted(outputs) == [["14", "0"], ["14", "0"], ["14", "1"]]
 
 
-def close_folder(folder: Path) -> None:
-    """Put a file in place of the cache folder, because for root no folder is read-only."""
-    (folder / "__pycache__").write_text("")
-
-
-def test_a_read_only_installation_uses_the_users_cache(package: Path, tmp_path: Path) -> None:
-    close_folder(package)
+def test_a_read_only_installation_uses_the_users_cache_or_none(
+    package: Path, tmp_path: Path
+) -> None:
+    # A file in place of the cache folder, because for root no folder is read-only.
+    (package / "__pycache__").write_text("")
     home = tmp_path / "home"
     places = {"HOME": str(home), "XDG_CACHE_HOME": str(home / ".cache")}
     values, log = run(package, **places)
     assert values == [14, 1]
     assert log.count(f"compiling kernels into {home / '.cache'}") == 1
     assert run(package, **places) == ([14, 0], "")
-
-
-def test_without_a_writable_folder_kernels_still_run(package: Path, tmp_path: Path) -> None:
-    close_folder(package)
-    home = tmp_path / "home"
-    home.write_text("")
-    values, log = run(package, HOME=str(home), XDG_CACHE_HOME=str(home / ".cache"))
+    (tmp_path / "file").write_text("")
+    values, log = run(package, HOME=str(tmp_path / "file"), XDG_CACHE_HOME=str(tmp_path / "file"))
     assert values == [14, 1]
     assert log.count("set NUMBA_CACHE_DIR to a writable folder") == 1
-
-
-def test_python_calls_kernels_with_all_arguments() -> None:
-    """A call that leaves one out takes numba's slow path, which takes longer than the kernel."""
-    trees = [ast.parse(file.read_text()) for file in (ROOT / "drake_pose").rglob("*.py")]
-    functions = [
-        (one, any(ast.unparse(place).startswith("compiled") for place in one.decorator_list))
-        for tree in trees
-        for one in ast.walk(tree)
-        if isinstance(one, ast.FunctionDef)
-    ]
-    kernels = [one for one, is_kernel in functions if is_kernel and one.args.defaults]
-    counts = {one.name: len(one.args.args) for one in kernels}
-    short = []
-    for function in (one for one, is_kernel in functions if not is_kernel):
-        for call in ast.walk(function):
-            if isinstance(call, ast.Call) and isinstance(call.func, ast.Name):
-                given = len(call.args) + len(call.keywords)
-                is_whole = any(isinstance(one, ast.Starred) for one in call.args)
-                if given < counts.get(call.func.id, 0) and not is_whole:
-                    short.append(f"{function.name}: {call.func.id}")
-    assert not short

@@ -26,11 +26,6 @@ def test_nested_maps_use_a_single_thread() -> None:
     assert len(set.union(*found)) == 3
 
 
-def test_errors_propagate() -> None:
-    with pytest.raises(ZeroDivisionError):
-        map_ordered(lambda k: 1 // k, range(3), 2)
-
-
 def test_none_keeps_the_number_of_workers() -> None:
     with use_workers(1), use_workers(None):
         names = set(map_ordered(lambda _: threading.current_thread().name, range(4)))

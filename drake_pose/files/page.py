@@ -146,8 +146,8 @@ def scene_title(summary: Mapping[str, Any]) -> str:
 
 
 def bad(text: str) -> Markup:
-    """Return a text of a table that stands out."""
-    return Markup('<span class="bad">{}</span>').format(text)
+    """Return a text of a table that stands out, without the folders of paths."""
+    return Markup('<span class="bad">{}</span>').format(without_folders(text))
 
 
 def share(fraction: float | None, unknown: str) -> str:

@@ -209,8 +209,7 @@ class Batch:
         content = without_nan(self.as_json())
         text = json.dumps(content, indent=2, ensure_ascii=False)
         write_file(self.out, "batch.json", text + "\n")
-        if not self.waiting and self.scenes:
-            batch_page(self.out, content, found).write(self.out)
+        batch_page(self.out, content, found).write(self.out)
 
     def plan(self) -> None:
         """Queue all scenes' tasks that have no result yet; scenes that cannot be read fail.

@@ -44,8 +44,7 @@ def run_demo(out: Path, on_frame: OnFrame = lambda *_: None) -> SceneEstimate:
     """Estimate the demonstration's scene.
 
     ``out``: folder for the result; the result of an earlier demonstration is replaced.
-    ``on_frame``: called before and after the only frame. Raises OutputError: the
-    folder holds other files.
+    ``on_frame``: called before and after the only frame. Raises OutputError: it holds other files.
     """
     scene = stored_scene("human")
     with claimed(out, resume=True):

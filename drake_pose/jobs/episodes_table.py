@@ -97,7 +97,7 @@ def episodes_table(
 def batch_page(
     folder: Path, content: Mapping[str, Any], episodes: Mapping[str, Mapping[str, Any]]
 ) -> Page:
-    """Return the page of a finished batch.
+    """Return the page of a batch.
 
     ``folder``: the batch's folder, with its files. ``content``: that of batch.json. ``episodes``:
     totals (`batch.Outcome`) by scene.

@@ -12,11 +12,9 @@ from types import SimpleNamespace
 
 import pytest
 
-import drake_pose
 from tests.cli import run_command
-from tests.jobs.scenes import TinyScene, read_rows, write_scene
+from tests.jobs.scenes import TinyScene
 
-PROGRAM = [sys.executable, "-m", "drake_pose.commands.main"]
 ROOT = Path(__file__).resolve().parents[2]
 
 
@@ -46,10 +44,7 @@ def test_help_and_jobs_import_nothing_heavy(module: str, heavy: str) -> None:
     [
         (signal.SIGTERM, "interrupted before anything was written"),
         (signal.SIGHUP, "interrupted before anything was written"),
-        (
-            PermissionError(13, "Permission denied", "a/\x1b[31mb"),
-            r"a/\x1b[31mb: Permission denied",
-        ),
+        (PermissionError(13, "denied", "a/\x1b[31mb"), r"a/\x1b[31mb: denied"),
         (UnicodeEncodeError("utf-8", "a/\udcfc", 2, 3, "no"), r"'a/\udcfc': the name of this file"),
     ],
 )
@@ -60,9 +55,7 @@ def test_every_failure_is_reported_in_one_line(while_parsing, ending, message, m
         os.kill(os.getpid(), ending)
         time.sleep(10.0)
 
-    if while_parsing and isinstance(ending, Exception):
-        return  # Parsing reads no files.
-    if while_parsing:
+    if while_parsing and not isinstance(ending, Exception):
         monkeypatch.setattr("drake_pose.commands.main.app", SimpleNamespace(parse_args=fail))
     else:
         monkeypatch.setattr("drake_pose.jobs.batch_tasks.read_job", fail)
@@ -76,14 +69,9 @@ def test_every_failure_is_reported_in_one_line(while_parsing, ending, message, m
     ("line", "instead"),
     [
         ("walk results/person", "Walker"),
-        ("undistort recording --out a", "cv2.undistort"),
         ("masks a --out b --box=1,2,3,4", "masks --box is gone: take the masks"),
-        ("capture scene --out new --start=first.csv", "masks"),
         ("reproduce all --out results", "tutorials/figures.md"),
-        ("reproduce kameda --images 3 --candidates 9", "PaperSearch"),
         ("register scene --model arm.urdf --out out --export=rerun", "load_cameras"),
-        ("capture scene --out new --tolerance 0.1", "one time"),
-        ("estimate scene --model a --out b --time-limit 3", "ends by itself"),
         ("batch jobs.yaml --out b --chunk=3", "job file"),
     ],
 )
@@ -93,11 +81,6 @@ def test_what_is_gone_names_what_to_use_instead(line: str, instead: str) -> None
     assert " is gone: " in result.stderr
     assert instead in result.stderr
     assert result.stderr.count("\n") == 1
-
-
-def test_version() -> None:
-    result = run_command(["--version"])
-    assert result.stdout == f"drake-pose {drake_pose.__version__}\n"
 
 
 def test_check_of_a_model(tiny_scene: TinyScene, tmp_path: Path) -> None:
@@ -111,51 +94,4 @@ def test_check_of_a_model(tiny_scene: TinyScene, tmp_path: Path) -> None:
     assert [node["name"] for node in report["nodes"]] == ["base", "boom", "jib"]
     result = run_command(["check", str(tmp_path / "nowhere.urdf"), "--json"])
     assert result.exit_code == 1
-    report = json.loads(result.stdout)
-    assert report["usable"] is False
-    assert "nowhere.urdf" in report["errors"][0]
-
-
-@pytest.mark.slow
-def test_ctrl_c_keeps_finished_frames_and_the_job_can_be_resumed(tmp_path: Path) -> None:
-    angles = [(20.0 * (index % 5 - 2), -20.0 * (index % 7)) for index in range(60)]
-    scene = write_scene(tmp_path / "scene", angles, ("front", "side"))
-    out = tmp_path / "out"
-    command = [*PROGRAM, "estimate", str(scene.folder), "--model", str(scene.model)]
-    command += ["--out", str(out), "--method", "paper", "--no-replay"]
-    environment = {**os.environ, "COLUMNS": "200"}
-    process = subprocess.Popen(
-        command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        # Background jobs ignore SIGINT, which children inherit.
-        env=environment, preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
-    )  # fmt: skip
-    poses = out / "poses.csv"
-    deadline = time.monotonic() + 120.0
-    while process.poll() is None and time.monotonic() < deadline:
-        if poses.is_file() and len(poses.read_text().splitlines()) > 3:
-            break
-        time.sleep(0.01)
-    process.send_signal(signal.SIGINT)
-    stdout, stderr = process.communicate(timeout=60)
-    assert process.returncode == 1, stderr
-    assert stdout == ""
-    assert stderr.startswith("drake-pose: error: interrupted")
-    assert "--resume" in stderr
-    assert str(out) in stderr
-    assert "Traceback" not in stderr
-    finished = poses.read_text().splitlines()
-    assert 3 < len(finished) < 61
-    summary = json.loads((out / "summary.json").read_text())
-    assert summary["complete"] is False
-    assert list(summary["frames"]) == [line.split(",")[0] for line in finished[1:]]
-
-    resumed = subprocess.run(
-        [*command, "--resume", "--json"], cwd=ROOT, capture_output=True, text=True, env=environment
-    )
-    assert resumed.returncode == 0, resumed.stderr
-    assert poses.read_text().splitlines()[: len(finished)] == finished
-    assert [row["frame"] for row in read_rows(poses)] == list(scene.truth)
-    summary = json.loads(resumed.stdout)
-    assert summary["complete"] is True
-    assert summary["found_count"] == 60
-    assert not list(out.rglob("*.part"))
+    assert "nowhere.urdf" in json.loads(result.stdout)["errors"][0]

@@ -3,6 +3,7 @@
 import pytest
 
 from drake_pose.jobs.cluster import open_cluster
+from tests.jobs.batches import write_scenes
 
 
 @pytest.fixture(scope="module")
@@ -13,6 +14,12 @@ def cluster():
     """
     with open_cluster(2) as client:
         yield client
+
+
+@pytest.fixture(scope="session")
+def scenes(tmp_path_factory):
+    """A folder of scenes for batches; shared, so do not modify it."""
+    return write_scenes(tmp_path_factory.mktemp("scenes"))
 
 
 @pytest.fixture

@@ -5,14 +5,14 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import yaml
 
 from drake_pose.body import ArticulatedModel, load_model
 from drake_pose.camera.camera_files import save_cameras
-from drake_pose.camera.models import Camera, PinholeCamera
+from drake_pose.camera.models import Camera, PinholeCamera, look_at
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.cli import Result, run_to_end
 from tests.written_files import write_mask
@@ -62,10 +62,7 @@ class TinyScene:
 def camera(name: str, turn_deg: float = 0.0) -> PinholeCamera:
     """Return a camera 3 m from the body, rotated about the vertical axis."""
     c, s = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
-    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    X_WC = np.eye(4)
-    X_WC[:3, :3] = turn @ np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-    X_WC[:3, 3] = turn @ np.array([3.0, 0.0, 0.3])
+    X_WC = look_at([3.0 * c, 3.0 * s, 0.3], [0.0, 0.0, 0.3])
     return PinholeCamera(name, 200, 160, 160.0, 160.0, 99.5, 79.5, X_WC)
 
 
@@ -113,15 +110,8 @@ def write_joints(path: Path, names: Sequence[str], values: Mapping[str, Iterable
     return path
 
 
-class Estimated(Protocol):
-    """A scene with a command to estimate it."""
-
-    def estimate(self, out: Path) -> list[str]:
-        """Return the words of an estimate command."""
-
-
 def run_estimate(
-    scene: Estimated, out: Path, *more: object, status: int = 0
+    scene: TinyScene, out: Path, *more: object, status: int = 0
 ) -> tuple[Result, dict[str, Any]]:
     """Run an estimate; return its output and its summary.json."""
     result = run_to_end(*scene.estimate(out), *more, status=status)

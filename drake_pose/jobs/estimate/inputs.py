@@ -154,16 +154,17 @@ def leave_out_links(
         root_position=np.zeros(3),
         root_rotation=RootRotation.free(),
     )
-    # A joint that a remaining link mimics is not held.
+    # A joint that a remaining link mimics is not held; the centre's own values are no joints.
     led = {
         centre.source(i) for i, one in enumerate(centre.nodes) if one.name not in settings.unseen
     }
-    unseen = [
-        one for i, one in enumerate(centre.nodes) if one.name in settings.unseen and i not in led
-    ]
-    names = [name for node in unseen for name in node.value_names]
     usual = user_units(model) * model.default_positions
-    held = {name: float(usual[model.position_index(name)]) for name in names}
+    held = {
+        name: float(usual[model.position_index(name)])
+        for i, one in enumerate(centre.nodes)
+        if one.name in settings.unseen and i not in led and one.parent >= 0
+        for name in one.value_names
+    }
     return model.without(settings.unseen), replace(settings, hold={**held, **settings.hold})
 
 

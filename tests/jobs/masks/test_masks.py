@@ -1,321 +1,268 @@
-"""Scenes of masks, read from other tools or segmented by a background."""
+"""Masks segmented by a background, or read from other tools, and doubts about them."""
 
 import filecmp
-import json
 import shutil
 
 import cv2
 import numpy as np
 import pytest
-from pycocotools import mask as coco
 
 from drake_pose import MaskSettings, load_scene, make_masks
-from drake_pose.errors import CameraError, DrakePoseError, MaskError, OutputError, SceneError
-from drake_pose.jobs.masks import doubt_mask, largest_patch, refuse_mask
+from drake_pose.camera.picture_files import read_picture
+from drake_pose.errors import DrakePoseError, MaskError, SceneError, SettingsError
+from drake_pose.jobs.mask_sources import open_source
+from drake_pose.jobs.masks import doubt_mask, find_masks, largest_patch, refuse_mask
 from drake_pose.silhouette.pictures.masks import intersection_over_union
-from tests.camera.recordings import numbered, write_film, write_video
-from tests.camera.test_data_sets import LENGTHS, write_v21
-from tests.cli import run_json, run_to_end
-from tests.jobs.masks.rooms import moving, write_pictures
-from tests.jobs.scenes import write_scene
+from drake_pose.silhouette.segmentation import (
+    background_of_recording,
+    learn_background,
+    person_region,
+)
+from tests.jobs.masks.rooms import (
+    HEIGHT,
+    WIDTH,
+    box,
+    save,
+    save_rig,
+    square,
+    texture,
+    write_coco,
+    write_masks,
+    write_room,
+)
+
+NOBODY = square(0, side=0)
+PLACES = [square(2 + 6 * k) for k in range(11)]
 
 
-@pytest.fixture(scope="module")
-def filmed(tmp_path_factory):
-    """Pictures of a moving crane by two cameras; shared, do not change them."""
-    folder = tmp_path_factory.mktemp("filmed") / "scene"
-    return write_pictures(folder, moving(), ("front", "side")).folder
+def test_objects_are_segmented_by_the_background_beside_the_pictures(tmp_path, out):
+    """The sixth picture shows nobody, the last one another light."""
+    truth = [*PLACES[:5], NOBODY, NOBODY]
+    folder, heard = write_room(tmp_path / "room", truth, ("front", "side")), []
+    for camera in ("front", "side"):
+        bright = folder / "images" / camera / "0006.png"
+        save(bright, cv2.imread(str(bright)) + 90.0)
+    result = make_masks(folder, out, on_mask=heard.append)
+    assert heard == [*range(1, 15)]
+    assert result.summary["mask_count"] == 10
+    assert filecmp.cmp(out / "cameras.yaml", folder / "cameras.yaml", shallow=False)
+    found = load_scene(out)
+    for camera in ("front", "side"):
+        room = learn_background([read_picture(folder / "background" / f"{camera}.png")])
+        for k, mask in enumerate(truth):
+            entry, name = result.summary["cameras"][camera][f"{k:04d}"], f"{camera}/{k:04d}"
+            picture = read_picture(folder / "images" / f"{name}.png")
+            drawn = cv2.imread(str(out / "overlay" / f"{name}.jpg")).astype(float)
+            brightness = drawn.mean() / picture.mean()
+            if k < 5:
+                own = found.read(camera, f"{k:04d}")
+                assert intersection_over_union(own, mask) > 0.9
+                assert entry["area"] == own.sum()
+                others = [person_region(picture, room.with_noise(n)) for n in (0.7, 1.4)]
+                ious = [intersection_over_union(own, one) for one in others]
+                assert entry["agreement"] == min(ious)
+                assert brightness == pytest.approx(1.0, abs=0.05)
+                edge = own & ~cv2.erode(own.view(np.uint8), np.ones((3, 3))).view(np.bool_)
+                near = np.abs(drawn - (0, 94, 213)).max(axis=2) < 90
+                assert near[edge].mean() > 0.9
+                assert near[~edge].mean() < 0.2
+            else:
+                assert ("not found" if k == 5 else "the light") in entry["refusal"]
+                assert f"{name}.png: {entry['refusal']}; no mask" in " ".join(result.warnings)
+                assert not (out / "masks" / f"{name}.png").exists()
+                assert brightness == pytest.approx(1 / 3, abs=0.05)
+    assert len(result.warnings) == 4
 
 
-@pytest.fixture
-def pictures(filmed, tmp_path):
-    """A copy of its pictures and cameras that may be changed."""
-    folder = tmp_path / "pictures"
-    for name in ("images", "background"):
-        shutil.copytree(filmed / name, folder / name)
-    shutil.copy(filmed / "cameras.yaml", folder)
-    return folder
-
-
-def agreement(made, filmed, moves=False):
-    """Return IoUs with the true masks, of the moving links only."""
-    true, found = load_scene(filmed), load_scene(made)
-    values = []
-    for camera in true.cameras:
-        masks = {f: true.read(camera, f) for f in true.frames}
-        still = np.logical_and.reduce(list(masks.values())) & moves
-        for frame in true.frames:
-            if (camera, frame) in found.masks:
-                pair = masks[frame] & ~still, found.read(camera, frame) & ~still
-                values.append(intersection_over_union(*pair))
-    return np.array(values)
-
-
-def test_background_beside_the_pictures_is_used(filmed, pictures, out):
-    result = make_masks(pictures, out)
-    assert result.summary["mask_count"] == 80
-    assert agreement(out, filmed).mean() > 0.88
-    assert filecmp.cmp(out / "cameras.yaml", filmed / "cameras.yaml", shallow=False)
-    overlay = cv2.imread(str(out / "overlay" / "side" / "0003.jpg"))
-    assert overlay.shape == (160, 200, 3)
-
-
-def test_median_of_a_recording_segments_only_what_moves(filmed, pictures, tmp_path, out):
-    shutil.rmtree(pictures / "background")
+def test_a_median_of_all_pictures_shows_what_never_moves(tmp_path, out):
+    """The first body walks by; the second stays around one place, however it moves there."""
     settings = MaskSettings(background="median")
-    result = make_masks(pictures, out, settings)
-    # The crane's base does not move.
-    assert sum("the body stays around one place" in text for text in result.warnings) == 2
-    assert agreement(out, filmed, moves=True).mean() > 0.8
-    angles = [(20.0 + 6.0 * k, -40.0 - 5.0 * k) for k in range(10)]
-    still = write_pictures(tmp_path / "scene", angles)
-    result = make_masks(still.folder / "images", tmp_path / "still", settings)
-    assert sum("the body stays around one place" in text for text in result.warnings) == 1
-    assert sum("masks are doubtful" in text for text in result.warnings) == 1
+    walking = write_room(tmp_path / "walking", PLACES, ("front", "side"))
+    # The background beside the pictures, of a body that is there, is not used.
+    save(walking / "background" / "front.png", np.full((HEIGHT, WIDTH, 3), 255.0))
+    result = make_masks(walking, out, settings, overlay=False)
+    found = load_scene(out)
+    for k, mask in enumerate(PLACES):
+        assert intersection_over_union(found.read("front", f"{k:04d}"), mask) > 0.85
+    assert result.warnings == ()
+    assert not (out / "overlay").exists()
+    assert result.summary["settings"] == {"background": "median"}
+    standing = [square(30 + 6 * (k % 2), 20 + 6 * (k % 3 > 0)) for k in range(9)]
+    room = write_room(tmp_path / "standing", standing)
+    warnings = [one.warnings for one in find_masks(open_source(room, None, None), settings)]
+    assert "stays around one place" in warnings[0][0]
+    assert set(warnings[1:]) == {()}
 
 
-def test_changed_light_and_pictures_of_another_size_are_named(pictures, tmp_path, out):
-    files = sorted((pictures / "images" / "front").iterdir())
-    cv2.imwrite(str(files[3]), 255 - cv2.imread(str(files[3])) // 2)
-    result = make_masks(pictures, out)
-    assert any("0003.png" in text and "the light" in text for text in result.warnings)
-    cv2.imwrite(str(pictures / "background" / "side.png"), np.zeros((10, 10, 3), np.uint8))
-    with pytest.raises(SceneError, match=r"side\.png.*10 x 10.*200 x 160"):
-        make_masks(pictures, tmp_path / "again")
-    (pictures / "background" / "side.png").unlink()
-    with pytest.raises(SceneError, match="no background picture of camera 'side'"):
-        make_masks(pictures, tmp_path / "again")
-    shutil.copy(pictures / "background" / "front.png", pictures / "background" / "side.png")
-    files[0].write_bytes(b"no picture")
-    with pytest.raises(SceneError, match=r"0000\.png"):
-        make_masks(pictures, tmp_path / "again")
-    (pictures / "cameras.yaml").unlink()
-    cv2.imwrite(str(files[0]), np.zeros((150, 200, 3), np.uint8))
-    with pytest.raises(SceneError, match=r"200 x 160.*'front' had before 200 x 150"):
-        make_masks(pictures, tmp_path / "again", MaskSettings(background="median"))
-    assert not any((tmp_path / "again").glob("**/*.png"))
+def test_a_median_of_a_long_recording_uses_every_second_picture(tmp_path):
+    masks = [square(7 * k % 60, 5 * k % 40, 8) for k in range(130)]
+    folder = write_room(tmp_path / "room", masks)
+    source = open_source(folder, None, None)
+    every = [read_picture(path) for path in sorted(folder.glob("images/front/*.png"))]
+    room = background_of_recording(every[::2])
+    for found, picture in zip(
+        find_masks(source, MaskSettings(background="median")), every, strict=True
+    ):
+        np.testing.assert_array_equal(found.mask, person_region(picture, room))
 
 
 def test_empty_and_full_masks_are_rejected_and_two_objects_warned_of():
-    mask = np.zeros((40, 60), bool)
-    assert "not found" in refuse_mask(mask)
-    assert "fills" in refuse_mask(~mask)
-    assert "border" in doubt_mask(~mask)[0]
-    mask[5:20, 10:30] = True
-    alone = mask.copy()
+    mask = square(10)
+    assert "not found" in refuse_mask(NOBODY)
+    full = np.ones((50, 50), bool)
+    assert "fills" in refuse_mask(full)
+    full[:, 0] = False
+    assert "fills" in refuse_mask(full)
+    full[0] = False
+    assert refuse_mask(full) == ""
+    assert "100% of the picture's border" in doubt_mask(~mask)[0]
     assert refuse_mask(mask) == ""
     assert doubt_mask(mask) == []
-    mask[25:35, 40:55] = True
-    (text,) = doubt_mask(mask)
-    assert "two objects" in text
-    assert "(20, 12)" in text
-    assert (largest_patch(mask) == alone).all()
-    assert not largest_patch(np.zeros_like(mask)).any()
+    both = mask | square(40, side=9)
+    (text,) = doubt_mask(both)
+    assert "256 pixels around (18, 28)" in text
+    assert "81 around (44, 24)" in text
+    assert (largest_patch(both) == mask).all()
+    assert (largest_patch(mask) == mask).all()
 
 
-POLYGON = [60.0, 40.0, 120.0, 40.0, 120.0, 100.0, 60.0, 100.0]
+def test_only_the_largest_region_is_kept_if_asked_for(tmp_path, out):
+    folder = write_masks(tmp_path / "masks", {"a": square(10) | square(40, side=9)})
+    for largest, area in ((False, 256 + 81), (True, 256)):
+        made = make_masks(folder, out / str(largest), MaskSettings(largest=largest))
+        assert made.summary["cameras"][""]["a"]["area"] == area
+        assert len(made.warnings) == 1 - largest
 
 
-@pytest.fixture
-def two_views(tmp_path):
-    """Masks of two cameras in three frames."""
-    return write_scene(tmp_path / "scene", cameras=("front", "side"))
-
-
-def runs_of(mask):
-    """Return a mask as COCO run lengths."""
-    runs = coco.encode(np.asfortranarray(mask, dtype=np.uint8))
-    return {"size": list(mask.shape), "counts": runs["counts"].decode()}
-
-
-def write_coco(path, scene, annotate, paths="{camera}/{frame}.jpg"):
-    """Write a COCO file; annotate(mask) returns the (class, segmentation) pairs of a picture."""
-    images, annotations = [], []
-    for k, ((camera, frame), _) in enumerate(scene.masks.items()):
-        mask = scene.read(camera, frame)
-        name = paths.format(camera=camera, frame=frame)
-        images.append({"id": k, "file_name": name, "width": mask.shape[1], "height": mask.shape[0]})
-        for number, segmentation in annotate(mask):
-            own = {"id": len(annotations), "category_id": number, "segmentation": segmentation}
-            annotations.append(own | {"image_id": k})
-    names = [{"id": 3, "name": "arm"}, {"id": 4, "name": "tool"}]
-    content = {"images": images, "annotations": annotations, "categories": names}
-    path.write_text(json.dumps(content))
-    return path
-
-
-def test_coco_run_lengths_become_the_same_masks(tmp_path, out, two_views):
-    scene = load_scene(two_views.folder)
-
-    def halves(mask):
-        upper = mask & (np.arange(len(mask)) < 70)[:, None]
-        return [(3, runs_of(upper)), (4, runs_of(mask & ~upper))]
-
-    file = write_coco(tmp_path / "a.json", scene, halves)
-    cameras = two_views.folder / "cameras.yaml"
-    result = make_masks(file, out, MaskSettings(classes=("arm", "4"), cameras=cameras))
-    assert (result.summary["mask_count"], result.warnings) == (6, ())
-    found = load_scene(out)
-    assert set(found.masks) == set(scene.masks)
-    assert all((found.read(*key) == scene.read(*key)).all() for key in scene.masks)
-    with pytest.raises(MaskError, match=r"classes arm, tool.*classes 'arm'"):
-        make_masks(file, tmp_path / "none", MaskSettings(cameras=cameras))
-    with pytest.raises(DrakePoseError, match=r"no class 'robot'; it has: arm, tool"):
-        make_masks(file, tmp_path / "none", MaskSettings(classes=("robot",), cameras=cameras))
-    assert not (tmp_path / "none").exists() or not any((tmp_path / "none").iterdir())
+def test_an_indistinct_object_is_doubtful(tmp_path, out):
+    rng = np.random.default_rng(0)
+    room = texture(rng, (HEIGHT, WIDTH))
+    save(tmp_path / "room.png", room)
+    ramp = 10.0 + 12.0 * np.tile(np.linspace(0.0, 1.0, WIDTH), (HEIGHT, 1))
+    for k, left in enumerate((10, 40)):
+        shown = room + (square(left, side=20) * (ramp if k else 90.0))[:, :, None]
+        save(tmp_path / "images" / "a" / f"{k}.png", shown)
+    save(tmp_path / "images" / "a" / "2.png", room + 90.0 * square(10)[:, :, None])
+    result = make_masks(tmp_path, out, MaskSettings(background=tmp_path / "room.png"))
+    (text,) = (one for one in result.warnings if "doubtful" in one)
+    assert "frame 1 (1 of 3)" in text
+    agreement = result.summary["cameras"]["a"]["1"]["agreement"]
+    assert f"IoU {agreement:.0%}" in text
 
 
 @pytest.mark.parametrize(
-    ("paths", "warning"),
+    ("names", "is_doubtful"),
     [
-        ("a9b8c7{frame[3]}f-{camera}_{frame}.jpg", ""),
-        ("{camera}/{frame[3]}a{frame}9f8d.jpg", "frames' names have parts like random ones"),
-        ("{camera}/s2a3b_00000{frame}.jpg", ""),
+        (("3a1b0", "3a1b1"), False),
+        (("3a1b0", "3c1b1"), True),
+        (("3a1b00000", "3a1b11111"), True),
+        (("cam3a_00000000", "cam3a_00000001"), False),
+        (("3a_0", "3b_1"), False),
     ],
 )
-def test_names_that_tell_the_frames_and_others(tmp_path, out, two_views, paths, warning):
-    scene = load_scene(two_views.folder)
-    file = write_coco(tmp_path / "a.json", scene, lambda _: [(3, [POLYGON])], paths)
-    content = json.loads(file.read_text())
-    for one in content["images"][::2]:
-        one["file_name"] = one["file_name"].replace("9", "c")
-    content["images"].reverse()
-    file.write_text(json.dumps(content))
-    result = make_masks(file, out, MaskSettings(cameras=scene.path / "cameras.yaml"))
-    assert bool(warning) == bool(result.warnings)
-    assert all(warning in text for text in result.warnings)
-    found = {name: [*own] for name, own in result.summary["cameras"].items()}
-    assert [len(own) for own in found.values()] == [3, 3]
-    if paths.startswith("a9b8"):
-        assert found == {key: [*scene.frames] for key in ("side", "front")}
+def test_frames_with_names_like_random_ones_have_a_doubtful_order(
+    tmp_path, out, names, is_doubtful
+):
+    folder = write_masks(tmp_path / "masks", dict.fromkeys(names, square(10)))
+    assert len(make_masks(folder, out).warnings) == is_doubtful
 
 
-@pytest.mark.parametrize("name", ["result.json", "annotations/default.json", "train/_coco.json"])
-def test_exported_folders_are_sources(tmp_path, out, two_views, name):
-    scene, export = load_scene(two_views.folder), tmp_path / "export"
-    for folder in (export / "images/default", (export / name).parent):
-        folder.mkdir(parents=True, exist_ok=True)
-    cv2.imwrite(str(export / "images/default/0.png"), numbered(0))
-    if name.startswith("train"):
-        (export / "images").rename(export / "train/images")
-    write_coco(export / name, scene, lambda _: [(3, [POLYGON])])
-    result = make_masks(export, out, MaskSettings(cameras=scene.path / "cameras.yaml"))
-    assert set(load_scene(out).masks) == set(scene.masks)
-    assert result.warnings == ()
+def test_masks_of_coco_files_are_those_of_the_chosen_classes(tmp_path, out):
+    both = [(3, box(10)), (4, box(40))]
+    file = write_coco(tmp_path / "a.json", {"front/0.jpg": both, "side/0.jpg": [(3, box(20))]})
+    save_rig(tmp_path / "cameras.yaml")
+    for k, (classes, areas) in enumerate(
+        ((("arm",), (1, 0)), (("arm", "4"), (1, 1)), (("all",), (1, 1)), (("3",), (1, 0)))
+    ):
+        settings = MaskSettings(classes=classes, cameras=tmp_path / "cameras.yaml")
+        result = make_masks(file, out / str(k), settings)
+        found = load_scene(out / str(k))
+        expected = areas[0] * square(10) | areas[1] * square(40)
+        assert (found.read("front", "0") == expected).all()
+        assert (found.read("side", "0") == square(20)).all()
+        assert result.summary["mask_count"] == 2
+    # A box without area, a picture without the object, and the only class.
+    boxes = {"front/0.jpg": [(3, box(10)), (4, [])], "side/0.jpg": []}
+    result = make_masks(write_coco(tmp_path / "b.json", boxes), out / "boxes")
+    assert "1 annotations have a box, but no area" in " ".join(result.warnings)
+    assert "side/0.jpg': the object is not found" in result.warnings[0]
+    assert "there is no cameras.yaml for the cameras front, side" in result.warnings[-1]
+    assert result.summary["cameras"]["front"]["0"]["area"] == 256
 
 
-def test_coco_polygons_without_cameras(tmp_path, out, two_views):
-    file = write_coco(tmp_path / "a.json", load_scene(two_views.folder), lambda _: [(3, [POLYGON])])
-    result = make_masks(file, out)
-    assert "there is no cameras.yaml" in result.warnings[0]
-    mask = cv2.imread(str(out / "masks" / "side" / "0001.png"), cv2.IMREAD_GRAYSCALE)
-    expected = np.zeros((160, 200))
-    expected[40:100, 60:120] = 255
-    assert (mask == expected).all()
+def coco(*pairs, **size):
+    """Write a COCO file of one picture with these annotations."""
+    return lambda folder: write_coco(folder / "a.json", {"front/0.jpg": pairs}, **size)
 
 
-def test_pictures_without_the_object_are_named(tmp_path, out, two_views):
-    scene = load_scene(two_views.folder)
-    count = iter(range(6))
-    file = write_coco(tmp_path / "a.json", scene, lambda _: [(3, [POLYGON])] if next(count) else [])
-    result = make_masks(file, out, MaskSettings(cameras=scene.path / "cameras.yaml"))
-    assert result.summary["mask_count"] == 5
-    assert "front/0000.jpg': the object is not found" in result.warnings[0]
-    assert "0000" not in [path.stem for path in (tmp_path / "out/masks/front").iterdir()]
-    empty = write_coco(tmp_path / "b.json", scene, lambda _: [])
-    with pytest.raises(MaskError, match=r"not found.*and 5 more"):
-        make_masks(empty, tmp_path / "none")
-    assert not (tmp_path / "none" / "masks").exists()
+def without_object(folder):
+    return write_coco(folder / "a.json", {f"front/{k}.jpg": [] for k in range(3)})
 
 
-def test_annotations_of_another_size_or_camera_are_refused(tmp_path, out, two_views):
-    scene = load_scene(two_views.folder)
-    cameras = scene.path / "cameras.yaml"
-    file = write_coco(tmp_path / "a.json", scene, lambda _: [(3, [POLYGON])], "x/{frame}.jpg")
-    with pytest.raises(SceneError, match=r"no folder of its path is a camera.*front, side"):
-        make_masks(file, out, MaskSettings(cameras=cameras))
-    with pytest.raises(SceneError, match="has frame 0000 twice"):
-        make_masks(file, out)
-    content = json.loads(file.read_text())
-    for one in content["images"]:
-        one |= {"width": 100, "file_name": f"side/{one['id']}.png"}
-    file.write_text(json.dumps(content))
-    with pytest.raises(SceneError, match=r"100 x 160 pixels.*camera 'side'.*200 x 160"):
-        make_masks(file, out, MaskSettings(cameras=cameras))
-    with pytest.raises(CameraError):
-        make_masks(file, out, MaskSettings(cameras=tmp_path / "none.yaml"))
+def room(change):
+    """Write a room that is changed."""
+
+    def write(folder):
+        change(write_room(folder, PLACES[:3], ("front", "side")))
+        return folder
+
+    return write
 
 
-def test_masks_in_a_video_become_a_sequence(tmp_path, out, two_views):
-    scene = load_scene(two_views.folder)
-    source = tmp_path / "source"
-    for camera in scene.cameras:
-        masks = [np.where(scene.read(camera, frame), 255, 0) for frame in scene.frames]
-        write_film(source / "videos" / f"{camera}.avi", masks, 25.0)
-    shutil.copy(scene.path / "cameras.yaml", source)
-    make_masks(source, out)
-    made = load_scene(out)
-    assert made.sequence
-    assert made.frame_rate_hz == 25.0
-    for (camera, frame), mask in zip(made.masks, scene.masks, strict=True):
-        assert (made.read(camera, frame) == scene.read(*mask)).mean() > 0.999
+def grown(name):
+    return room(lambda folder: save(folder / name, np.zeros((10, 20, 3))))
 
 
-def test_an_episode_of_a_data_set_is_a_source(tmp_path, out):
-    write_v21(tmp_path)
-    with pytest.raises(SceneError, match="choose an episode"):
-        make_masks(tmp_path, out, MaskSettings(background="median"))
-    result = make_masks(tmp_path, out, MaskSettings(background="median", episode=1))
-    frames = [f"{k:06d}" for k in range(LENGTHS[1])]
-    found = {name: [*own] for name, own in result.summary["cameras"].items()}
-    assert found == {"top": frames, "wrist": frames}
-    assert (out / "scene.yaml").read_text() == "frame_rate_hz: 10.0\nsequence: true\n"
+def uncalibrated(folder):
+    (folder / "cameras.yaml").unlink()
+    save(folder / "images" / "side" / "0001.png", np.zeros((10, 20, 3)))
 
 
-def test_a_camera_without_pictures_uses_its_video(tmp_path, out):
-    for k, name in enumerate(("a", "b")):
-        (tmp_path / "images" / "a").mkdir(parents=True, exist_ok=True)
-        cv2.imwrite(str(tmp_path / "images" / "a" / f"{k}.png"), numbered(k))
-        write_video(tmp_path / "videos" / f"{name}.mp4", range(3))
-    room = numbered(0)
-    room[:20, :20] = 90
-    cv2.imwrite(str(tmp_path / "room.png"), room)
-    result = make_masks(tmp_path, out, MaskSettings(background=tmp_path / "room.png"))
-    counts = {name: len(own) for name, own in result.summary["cameras"].items()}
-    assert counts == {"a": 2, "b": 3}
+@pytest.mark.parametrize(
+    ("write", "settings", "error", "words"),
+    [
+        (coco((3, box(1)), (4, box(2))), {}, MaskError, "classes arm, tool"),
+        (coco((3, box(1))), {"classes": "robot"}, DrakePoseError, "'robot'; it has: arm"),
+        (coco((3, [[1, 2, 3]])), {}, MaskError, "front/0.jpg': a segmentation"),
+        (coco((3, box(1))), {"background": "median"}, SceneError, "a.json: has annotations"),
+        (without_object, {}, MaskError, r"front/0.jpg.*not found.*and 2 more"),
+        (grown("images/front/0002.png"), {}, SceneError, r"0002\.png.*20 x 10.*'front'.*80 x 60"),
+        (grown("background/side.png"), {}, SceneError, r"side\.png.*20 x 10.*80 x 60"),
+        (
+            room(lambda folder: (folder / "background" / "side.png").unlink()),
+            {}, SceneError, "background picture of camera 'side'",
+        ),
+        (
+            room(lambda folder: (folder / "images" / "side" / "0001.png").write_bytes(b"no")),
+            {}, SceneError, r"0001\.png",
+        ),
+        (room(uncalibrated), {"background": "median"}, SceneError, r"0001\.png.*20 x 10"),
+        (
+            room(lambda folder: (folder / "images" / "side" / "0001.png").unlink()),
+            {"background": "median"}, SettingsError, "camera 'side'",
+        ),
+    ],
+)  # fmt: skip
+def test_refusals(tmp_path, write, settings, error, words):
+    path = write(tmp_path / "source")
+    with pytest.raises(error, match=words):
+        make_masks(path, tmp_path / "out", MaskSettings(**settings))
+    assert not any((tmp_path / "out").rglob("*.*g"))
 
 
-def test_ambiguous_sources_are_refused(tmp_path, out, two_views):
-    masks = two_views.folder / "masks"
-    with pytest.raises(SceneError, match="no such folder or file"):
-        make_masks(tmp_path / "none", out)
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(SceneError, match="has no pictures"):
-        make_masks(tmp_path / "empty", out)
-    shutil.copy(two_views.folder / "cameras.yaml", masks)
-    (masks / "front").rename(masks / "middle")
-    with pytest.raises(SceneError, match=r"'middle' belong to no camera.*front, side"):
-        make_masks(masks, out)
-    with pytest.raises(SceneError, match=r"not in a camera's folder.*2 cameras"):
-        make_masks(masks / "side", out, MaskSettings(cameras=masks / "cameras.yaml"))
-    make_masks(masks / "side", out)
-    assert load_scene(out).scale_unknown
-    with pytest.raises(OutputError, match="not empty"):
-        make_masks(masks / "side", out)
-
-
-def test_command_says_what_was_made(tmp_path, two_views):
-    source = two_views.folder / "masks" / "side"
-    assert run_json("masks", source, "--out", tmp_path / "a")["mask_count"] == 3
-    assert "3 masks of 3 pictures" in run_to_end("masks", source, "--out", tmp_path / "b").stdout
-    photograph = tmp_path / "photograph.png"
-    noise = np.random.default_rng(0).integers(0, 255, (9, 9, 3), dtype=np.uint8)
-    noise[0] = 0
-    cv2.imwrite(str(photograph), noise)
-    done = run_to_end("masks", photograph, "--out", tmp_path / "c", status=1)
-    assert "photograph.png: the mask has" in done.stderr
-    assert "threshold it first" in done.stderr
-    blurred = np.where(load_scene(two_views.folder).read("side", "0000"), 255, 0).astype(np.uint8)
-    cv2.imwrite(str(tmp_path / "mask.jpg"), blurred)
-    make_masks(tmp_path / "mask.jpg", tmp_path / "d")
-    assert (load_scene(tmp_path / "d").read("camera", "mask") == (blurred > 0)).all()
+def test_backgrounds_of_pictures_without_cameras(tmp_path, out):
+    """A single picture of the room is that of every camera; a folder has several of a camera."""
+    folder = write_room(tmp_path / "room", PLACES[:3])
+    room = folder / "background" / "front.png"
+    several = tmp_path / "several" / "front"
+    several.mkdir(parents=True)
+    shutil.copy(room, several / "0.png")
+    save(several / "1.png", cv2.imread(str(room)) + 9.0)
+    for name, given in (("one", room), ("more", tmp_path / "several")):
+        make_masks(folder, out / name, MaskSettings(background=given))
+        mask = load_scene(out / name).read("front", "0001")
+        assert intersection_over_union(mask, PLACES[1]) > 0.9
+    # Of an unnamed camera, a picture of another size than the background's.
+    single = save(tmp_path / "single.png", np.zeros((30, 40, 3)))
+    with pytest.raises(SceneError, match="differs in size from the background, 80 x 60"):
+        make_masks(single, out / "none", MaskSettings(background=room))

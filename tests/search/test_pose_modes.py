@@ -8,7 +8,6 @@ from scipy.sparse.csgraph import connected_components
 
 from drake_pose.body import RootRotation
 from drake_pose.search import View, renderer_tolerance, samples_at
-from drake_pose.search.partial_poses import BoundLimits
 from drake_pose.search.pose_modes import (
     cluster_samples,
     contour_length,
@@ -108,17 +107,6 @@ def test_pose_set_matches_its_definition(maker, tolerance):
     assert order[0][0] == problem.best[1]
     for mode in answer.modes:
         assert mode.J == problem.objective(mode.node_values)
-
-
-@pytest.mark.parametrize("limits", [{"time_limit": 0.0}, {"states": 1}, {"pairs": 1}])
-def test_a_limit_keeps_the_best_pose_and_is_reported(flipping_body, limits):
-    problem = flipping_body.make(np.random.default_rng(24), views=1)
-    samples, J = problem.best
-    answer = find_modes(problem.body, problem.views, samples, J, 60.0, limits=BoundLimits(**limits))
-    assert (answer.complete, answer.budget_spent) == (False, True)
-    assert answer.graph.contains(samples)
-    assert answer.modes[0].J == J
-    assert not any(answer.determined)
 
 
 def test_contours_and_the_renderers_tolerance(flipping_body):

@@ -21,8 +21,6 @@ from drake_pose.search.refinement import (
 )
 from drake_pose.silhouette.outline import TreeSurfaces
 from drake_pose.silhouette.scoring import draw_mask
-from tests.search.arms import gripper
-from tests.search.bodies import forked_body, swinging_chain
 
 _X_WC = np.array(
     [[0.0, 0.0, -1.0, 5.0], [1.0, 0.0, 0.0, 0.1], [0.0, -1.0, 0.0, -0.35], [0.0, 0.0, 0.0, 1.0]]
@@ -82,21 +80,6 @@ def test_J_equals_the_area_of_the_drawn_difference(body, kind):
     assert problem.J(random_pose(body, 1)) == 0
 
 
-def test_errors_near_parts_and_border_length(body, search):
-    camera = camera_of("parallel")
-    problem = problem_of(body, random_pose(body, 1), [camera])
-    pose = random_pose(body, 2)
-    v, u = np.nonzero(drawn(body, pose, camera) != problem.views[0].mask)
-    reaches = search.reaches(problem, pose)[0]
-    expected = [np.count_nonzero((u - x) ** 2 + (v - y) ** 2 < r**2) for x, y, r in reaches]
-    np.testing.assert_allclose(search.errors_near(problem, pose), expected, rtol=0.03, atol=15.0)
-    # The estimated length of a border along rows and columns is pi / 4 of the true one.
-    square = np.zeros((400, 400), dtype=bool)
-    square[100:200, 100:300] = True
-    lone = RefinementProblem(body, [View(camera, square)])
-    assert lone.border_length == pytest.approx(600.0 * math.pi / 4.0)
-
-
 @pytest.mark.parametrize("kind", ["parallel", "pinhole"])
 def test_one_step_reverts_a_small_change(body, kind):
     """The normal equations give the change of each value, so their derivatives are right."""
@@ -137,50 +120,6 @@ def test_a_refined_pose_is_a_local_optimum_within_the_limits(body):
                 moved = refined.copy()
                 moved[j] = np.clip(moved[j] + sign * 0.02, body.lower[j], body.upper[j])
                 assert problem.J(moved) >= 0.9 * least
-
-
-def test_a_misplaced_part_is_corrected(body, search):
-    true = random_pose(body, 11, fraction=0.5)
-    problem = problem_of(body, true, [camera_of("parallel")])
-    wrong = true.copy()
-    names = [node.name for node in body.tree.nodes]
-    for name, by in (("left_upper_arm", -1.2), ("left_forearm", 0.5)):
-        own = np.flatnonzero(body.kinematics.value_nodes == names.index(name))
-        wrong[own] = np.clip(wrong[own] + by, body.lower[own], body.upper[own])
-    found, J = NeighbourhoodSearch(problem, search).improve(wrong, 0.0)
-    assert J == problem.J(found) < 0.25 * problem.J(wrong)
-    again, _ = NeighbourhoodSearch(problem, search).improve(wrong, 0.0)
-    np.testing.assert_array_equal(found, again)
-    once, _ = NeighbourhoodSearch(problem, search).improve(wrong, 0.0, tries=0)
-    np.testing.assert_array_equal(once, wrong)
-
-
-def test_parts_are_ends_of_limbs_and_nodes_of_the_trunk(body):
-    nodes = body.tree.nodes
-    parts = find_parts(body.tree)
-    assert {node for part in parts for node in part.nodes} == set(range(len(nodes)))
-    for part in parts:
-        for before, after in zip(part.nodes, part.nodes[1:], strict=False):
-            assert nodes[after].parent == before
-        assert part.held == tuple(nodes[part.nodes[-1]].children)
-
-
-def test_parts_do_not_extend_over_a_fork_or_start_at_a_follower(tmp_path):
-    """A chain has no reflection; its ends have one to three nodes."""
-    fork, fingers, chain = (
-        model.pose_tree()
-        for model in (
-            forked_body(tmp_path), gripper(tmp_path, follows=True), swinging_chain(tmp_path, 5)
-        )
-    )  # fmt: skip
-    assert [(part.nodes, part.held) for part in find_parts(fork)] == [
-        ((1,), ()), ((2,), ()), ((0,), (1, 2)),
-    ]  # fmt: skip
-    assert [part.nodes for part in find_parts(fingers)] == [(2, 3), (1, 2, 3), (0,)]
-    assert [part.nodes for part in find_parts(chain)] == [(4,), (3, 4), (2, 3, 4), (0,), (1,)]
-    assert find_reflections(chain) == ()
-    (whole,) = find_reflections(fork)
-    assert (whole.nodes, whole.sources, whole.held) == ((0, 1, 2), (0, 2, 1), ())
 
 
 def centers(body, parameters, part):

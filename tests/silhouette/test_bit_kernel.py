@@ -1,17 +1,18 @@
-"""Bit masks against the span kernel's masks; pruning by balls and discs is conservative."""
+"""Bit masks against the span kernel's masks.
+
+Pruning by balls and discs is compared with brute force in ``tests/search``.
+"""
 
 import numpy as np
 import pytest
-import trimesh
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial.transform import Rotation
 
-from drake_pose.body import TriangleMesh
 from drake_pose.camera.models import ParallelCamera, PinholeCamera
-from drake_pose.silhouette.bit_kernel import draw_bits, draw_discs, make_bit_view, prune_by_balls
+from drake_pose.silhouette.bit_kernel import draw_bits, make_bit_view
 from drake_pose.silhouette.contour_points import divide_outline
 from drake_pose.silhouette.outline import outline_from_mesh
-from drake_pose.silhouette.scoring import VisualHull, draw_mask
+from drake_pose.silhouette.scoring import draw_mask
 from tests.silhouette.shapes import soup
 
 _POSES = 60
@@ -82,47 +83,3 @@ def test_bits_equal_the_span_kernels_pixels(camera, spread):
     distance = distance_transform_edt(~mask)
     assert band.any()
     assert distance[band].max() <= 5 * np.sqrt(2.0)
-
-
-def test_poses_beyond_the_limit_are_skipped():
-    camera, outline, mask = CAMERAS[0], crooked_surface(5), random_mask(6)
-    view = make_bit_view(mask, camera.kernel_parameters(), camera.X_CW, 0)
-    X_WN = random_poses(7)
-    masks = [draw_mask([outline], X[None], camera) for X in X_WN]
-    outside = np.array([int((drawn & ~mask).sum()) for drawn in masks])
-    limit = float(np.median(outside))
-    kept = draw_bits(divide_outline(outline), view, np.eye(4)[None], X_WN, PAIRS, limit)[0]
-    assert np.array_equal(kept, outside <= limit)
-
-
-BALL = trimesh.creation.icosphere(3)
-ELLIPSOID = outline_from_mesh(TriangleMesh(BALL.vertices * [0.05, 0.08, 0.2], BALL.faces))
-
-
-@pytest.mark.parametrize("camera", CAMERAS, ids=lambda camera: camera.name)
-@pytest.mark.parametrize("limit", [0.0, 40.0])
-def test_pruning_keeps_every_pose_within_the_limit(camera, limit):
-    outline, mask = ELLIPSOID, np.zeros((70, 90), dtype=bool)
-    mask[10:60, 15:80] = True
-    mask[30:34, 40:44] = False
-    view = make_bit_view(mask, camera.kernel_parameters(), camera.X_CW, 0)
-    X_WN = random_poses(8)
-    balls = VisualHull(outline).spread_balls(8)
-    p_PB = balls[:, :3] @ np.swapaxes(X_WN[:, :3, :3], 1, 2) + X_WN[:, None, :3, 3]
-    left = prune_by_balls(view, np.eye(4)[None], p_PB, balls[:, 3].copy(), PAIRS, limit)
-    masks = [draw_mask([outline], X[None], camera) for X in X_WN]
-    outside = np.array([int((drawn & ~mask).sum()) for drawn in masks])
-    assert left[outside <= limit].all()
-    assert not left[outside > 400].all()
-
-
-@pytest.mark.parametrize("camera", CAMERAS, ids=lambda camera: camera.name)
-def test_discs_contain_the_surface(camera):
-    outline, mask = ELLIPSOID, random_mask(9)
-    view = make_bit_view(mask, camera.kernel_parameters(), camera.X_CW, 0)
-    X_WN = random_poses(10)
-    runs, words = draw_discs(view, X_WN, outline.ball[:3], float(outline.ball[3]))
-    for X, run in zip(X_WN, runs, strict=True):
-        drawn = draw_mask([outline], X[None], camera)
-        disc = read_bits(view, view.inside, run, words)
-        assert not (drawn & mask & ~disc).any()

@@ -228,7 +228,7 @@ def _read(path: Path, episode_ids: frozenset[str]) -> Content:
             kind = "NumPy"
             loaded = np.load(io.BytesIO(data), allow_pickle=False)
             value = np.atleast_1d(loaded) if isinstance(loaded, np.ndarray) else dict(loaded)
-        elif text.startswith("%YAML:1.0") or "<opencv_storage" in text[:200]:
+        elif "!!opencv-" in text or text.startswith("%YAML:1.0") or "<opencv_storage" in text[:200]:
             kind = "FileStorage"
             mode = cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY
             storage = cv2.FileStorage(text, mode)

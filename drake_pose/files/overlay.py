@@ -115,16 +115,15 @@ def draw_shapes(
 
     Returns (h, w, 3) uint8 RGB.
     """
-    colours, legend = (MISSING_RGB, EXCESS_RGB)[: len(shapes)], []
-    window, picture = (slice(None), slice(None)), observed
+    legend, window, picture = list[tuple[Colour, str]](), (slice(None), slice(None)), observed
     if observed.ndim == 2:
         window = _surroundings(np.logical_or.reduce([observed, *shapes]))
         picture = np.where(observed[..., None], AGREEMENT_RGB, BACKGROUND_RGB)
         legend = [(AGREEMENT_RGB, "silhouette")]
     picture = _enlarged(picture[window])
-    for shape, colour in zip(shapes, colours, strict=True):
+    for shape, colour, name in zip(shapes, (MISSING_RGB, EXCESS_RGB), names, strict=False):
         _draw_contour(picture, _enlarged(shape[window]), colour, 2)
-    legend += zip(colours, names, strict=True)
+        legend.append((colour, name))
     return _framed(picture, title, legend)
 
 

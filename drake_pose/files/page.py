@@ -152,8 +152,7 @@ def bad(text: str) -> Markup:
 
 def share(fraction: float | None, unknown: str) -> str:
     """Return a fraction in percent; ``unknown`` for None or nan."""
-    is_known = fraction is not None and np.isfinite(fraction)
-    return f"{100.0 * fraction:.1f} %" if fraction is not None and is_known else unknown
+    return unknown if fraction is None or np.isnan(fraction) else f"{100.0 * fraction:.1f} %"
 
 
 def p_value(p: float) -> str:
@@ -203,7 +202,7 @@ def plot(
 
     Args:
         curves: the curves; dots if they are not joined.
-        labels: (n,) names of the steps; some are written below the axis.
+        labels: (n,) names of the steps, at least one; some are written below the axis.
         about: what the plot shows.
         bands: intervals, drawn behind the curves.
         limits: values of dashed lines; those farther away than the curves span are not drawn.
@@ -217,9 +216,9 @@ def plot(
     low = min(low, least)
     near = [x for x in limits if low - (high - low) <= x <= high + (high - low)]
     low, high = min([low, *near]), max([high, *near])
-    margin = 0.06 * (high - low or max(abs(high), 1.0))
+    ticks, margin = np.unique(np.linspace(low, high, 3)), 0.06 * (high - low or max(abs(high), 1.0))
     low, high = low - (0.0 if low == least else margin), high + margin
-    step = (width - left - top) / max(len(labels), 1)
+    step = (width - left - top) / len(labels)
     x = left + step * (np.arange(len(labels)) + 0.5)
 
     def y(value: Any) -> Any:
@@ -229,7 +228,7 @@ def plot(
         Markup('<path class="axis" d="M{0:.0f} {1:.1f}H{2:.0f}"/><text x="{3:.0f}" y="{4:.1f}" '
                'text-anchor="end">{5:.3g}</text>').format(
             left, y(value), width - top, left - 5.0, y(value) + 4.0, value)
-        for value in np.linspace(low + margin, high - margin, 3)
+        for value in ticks
     ]  # fmt: skip
     for name, *ends in bands:
         lines = zip(x, *(y(one) for one in ends), strict=True)
@@ -250,7 +249,7 @@ def plot(
             before = known
         kind = "" if joined else " dots"
         marks.append(Markup('<path class="curve c{}{}" d="{}"/>').format(name, kind, path))
-    for k in sorted({0, len(labels) // 2, len(labels) - 1} if labels else ()):
+    for k in sorted({0, len(labels) // 2, len(labels) - 1}):
         place = Markup('<text x="{:.1f}" y="{:.0f}" text-anchor="middle">{}</text>')
         marks.append(place.format(x[k], height - 6.0, labels[k][:20]))
     head = Markup('<svg class="plot" viewBox="0 0 {:.0f} {:.0f}" role="img" aria-label="{}">')

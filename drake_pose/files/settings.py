@@ -191,8 +191,7 @@ def parse_root_rotation(text: str) -> RootTurns:
 
 def percent(fraction: float | None) -> str:
     """Return a fraction in percent with two decimals; "unknown" for None or nan."""
-    is_known = fraction is not None and fraction == fraction  # Only nan differs from itself.
-    return f"{100.0 * fraction:.2f} %" if fraction is not None and is_known else "unknown"
+    return "unknown" if fraction is None or math.isnan(fraction) else f"{100.0 * fraction:.2f} %"
 
 
 def documented(cls: _Settings) -> _Settings:

@@ -11,7 +11,6 @@ import numpy as np
 SIDE, BITS = 64, 8
 LENS = "width: 64, height: 64, focal_x: 70, focal_y: 75, center_x: 31.5, center_y: 30"
 K = np.array([[70.0, 0.0, 31.5], [0.0, 75.0, 30.0], [0.0, 0.0, 1.0]])
-GRID = np.moveaxis(np.indices((SIDE, SIDE))[::-1], 0, -1).reshape(-1, 1, 2).astype(float)
 
 
 def numbered(k: int, width: int = SIDE) -> np.ndarray:
@@ -28,19 +27,6 @@ def number_of(picture: np.ndarray) -> int:
     assert red > 150 > 100 > blue, "the top is not red"
     row = picture[SIDE // 2, :, 1].reshape(BITS, -1).mean(axis=1)
     return int(sum(1 << b for b in range(BITS) if row[b] > 120))
-
-
-def shade(rays: np.ndarray) -> np.ndarray:
-    """Return a smooth grey image (64, 64) of its pixels' directions (x / z, y / z)."""
-    x, y = rays.reshape(-1, 2).T
-    grey = 128 + 60 * np.sin(4 * x) + 60 * np.cos(3 * y)
-    return grey.reshape(SIDE, SIDE).round().astype(np.uint8)
-
-
-def distorted(D: Sequence[float], fisheye: bool = False) -> np.ndarray:
-    """Return the image of `shade` through a lens, by OpenCV's map from pixels to directions."""
-    undistort = cv2.fisheye.undistortPoints if fisheye else cv2.undistortPoints
-    return shade(undistort(GRID, K, np.array(D)))
 
 
 def write_pictures(

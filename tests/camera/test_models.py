@@ -74,6 +74,10 @@ def test_poses_and_kernel_parameters():
         np.testing.assert_array_equal(camera.kernel_parameters(), expected)
         np.testing.assert_allclose(camera.X_CW @ camera.X_WC, np.eye(4), atol=1e-14)
         assert not camera.X_WC.flags.writeable
+        # A rounded rotation becomes exact.
+        R = camera.with_pose(np.round(X_WC, 6)).X_WC[:3, :3]
+        np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-14)
+        np.testing.assert_allclose(R, X_WC[:3, :3], atol=2e-6)
         moved = camera.with_pose(np.eye(4))
         assert np.array_equal(moved.X_WC, np.eye(4))
         np.testing.assert_array_equal(moved.kernel_parameters(), camera.kernel_parameters())
@@ -96,12 +100,6 @@ def test_invalid_parameters_are_named():
                 replace(PINHOLE, **{field: value})
         with pytest.raises(CameraError, match=r"'flat'.*pixels_per_metre"):
             replace(PARALLEL, pixels_per_metre=-1.0)
-
-
-def test_rounded_rotation_becomes_exact():
-    R = replace(PINHOLE, X_WC=np.round(X_WC, 6)).X_WC[:3, :3]
-    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-14)
-    np.testing.assert_allclose(R, X_WC[:3, :3], atol=2e-6)
 
 
 def test_conversion_to_drake_and_back():

@@ -119,13 +119,9 @@ def load(path, content, intrinsics, recording=None):
 
 
 FORMS = {
-    "six": SIX,
-    "six, deg": [*SIX[:3], *np.degrees(SIX[3:]).tolist()],
-    "seven": [*SIX[:3], *QUATERNION],
-    "matrix": X.tolist(),
-    "X_WC": {"X_WC": X.tolist()},
-    "3 x 4": {"T_base_cam": X[:3].tolist()},
-    "flat": {"T_cam2base": X.ravel().tolist()},
+    "six": SIX, "six, deg": [*SIX[:3], *np.degrees(SIX[3:]).tolist()],
+    "seven": [*SIX[:3], *QUATERNION], "matrix": X.tolist(), "X_WC": {"X_WC": X.tolist()},
+    "3 x 4": {"T_base_cam": X[:3].tolist()}, "flat": {"T_cam2base": X.ravel().tolist()},
     "inverse": {"T_cam_base": inverse_pose(X).tolist()},
     "view": {"world_to_camera": inverse_pose(X).tolist()},
     "wxyz": {"position": SIX[:3], "quat_wxyz": [QUATERNION[3], *QUATERNION[:3]]},
@@ -134,47 +130,41 @@ FORMS = {
     "angles": PLACE | dict(zip(("roll", "pitch", "yaw"), SIX[3:], strict=True)),
     "rpy_deg": {"xyz": SIX[:3], "rpy_deg": np.degrees(SIX[3:]).tolist()},
     "rpy": {"xyz": SIX[:3], "rpy": SIX[3:]},
-}
+}  # fmt: skip
 FRAMES = [transform("base", "mount", MOVED), transform("mount", "camera_optical_frame", SAME)]
 REALSENSE = urdf(
     ("base", "camera_link", X_LINK), ("camera_link", "camera_depth_optical_frame", POST),
     ("camera_link", "camera_color_optical_frame", inverse_pose(X_LINK) @ X),
 )  # fmt: skip
 FILES = [
-    *((f"{name}.json", {"left": form}) for name, form in FORMS.items()),
-    ("easy.yaml", easy()),
+    *((f"{name}.json", {"left": form}) for name, form in FORMS.items()), ("easy.yaml", easy()),
     ("easy.yaml", EASY | {"transformation": PLACE | Q}),
     ("easy.calib", {"parameters": EASY | {"calibration_type": "eye_on_base"}, "transform": MOVED}),
     ("easy.yaml", easy(LINK_Q, tracking_base_frame="camera_link")),
     ("pose.launch", launch(QUATERNION, "cam_optical")),
     ("pose.launch", launch(LINK_Q, "camera_link")),
     ("pose.launch", launch(SIX[:2:-1], "cam_optical", "100")),
-    *(
-        ("pose.launch.py", f"LaunchDescription([Node(package='tf2_ros', {', '.join(words)})])")
-        for words in (PUBLISHER, PUBLISHER[::-1])
-    ),
     ("pose.launch.xml", ros_transforms([CAMERA], {"left": "base"})),
     ("tf.yaml", {"transforms": FRAMES}),
     ("notepad.json", codecs.BOM_UTF8 + json.dumps({"left": SIX}).encode()),
-    ("rounded.yaml", {"T_base_camera": X.round(3).tolist()}),
-    ("rounded.txt", 2 * ECHO),
-    ("one.npy", saved(np.save, X)),
-    ("frames.npy", saved(np.save, np.repeat(X[None], 9, 0))),
-    ("named.npz", saved(np.savez, left=X)),
-    ("first.npz", saved(np.savez, X[:3])),
+    ("rounded.yaml", {"T_base_camera": X.round(3).tolist()}), ("rounded.txt", 2 * ECHO),
+    ("one.npy", saved(np.save, X)), ("frames.npy", saved(np.save, np.repeat(X[None], 9, 0))),
+    ("named.npz", saved(np.savez, left=X)), ("first.npz", saved(np.savez, X[:3])),
     ("cv2.npz", saved(np.savez, R_cam2base=X[:3, :3], t_cam2base=X[:3, 3:])),
     ("front.txt", saved(np.savetxt, X)),
     ("front.csv", saved(np.savetxt, X[:3], delimiter=",", header="X_WC of left")),
-    ("agibot.json", 3 * [{"extrinsic": PLAIN}]),
-    ("list.json", [{"camera": "left", **PLAIN}]),
+    ("agibot.json", 3 * [{"extrinsic": PLAIN}]), ("list.json", [{"camera": "left", **PLAIN}]),
     ("list.json", [X.tolist()]),
     ("list.json", [{"cam_id": "a", "pose": POST.tolist()}, {"cam_id": "left", "pose": SIX}]),
     ("post.urdf", urdf(("base", "post", POST), ("post", "cam_optical", ON_POST))),
     ("link.urdf", urdf(("base", "post", POST), ("post", "camera", inverse_pose(POST) @ X_LINK))),
-    ("realsense.urdf", REALSENSE),
-    ("mujoco.xml", mujoco_cameras([CAMERA])),
+    ("realsense.urdf", REALSENSE), ("mujoco.xml", mujoco_cameras([CAMERA])),
     ("viewer.xml", mjcf(VIEWER)),
-]
+    *(
+        ("pose.launch.py", f"LaunchDescription([Node(package='tf2_ros', {', '.join(words)})])")
+        for words in (PUBLISHER, PUBLISHER[::-1])
+    ),
+]  # fmt: skip
 WRIST = mjcf('name="left"', '<body name="tool0"><joint/><body>{}</body></body>')
 CV2 = saved(np.savez, R_cam2gripper=X[:3, :3], t_cam2gripper=X[:3, 3])
 ON_LINKS = [
@@ -211,17 +201,10 @@ def test_files_of_many_episodes_give_the_recordings_own(tmp_path):
     other = {serial: [*np.add(SIX[:3], 1.0).tolist(), *SIX[3:]], f"{serial}_quality_metric": 0.9}
     right = {serial: SIX, f"{serial}_metric_type": "iou", "relative_path": "AUTOLab/success"}
     poses = {"RAIL+1+2023": other, own: right}
-    lenses = {"RAIL+1+2023": {serial: [1.0, 2.0, 3.0, 4.0]}}
-    lenses |= {own: {serial: [530.0, 640.0, 531.0, 360.0]}}
-    (tmp_path / "intrinsics.json").write_text(json.dumps(lenses))
-    (tmp_path / "cam2base_extrinsics.json").write_text(json.dumps(poses))
-    known = intrinsics_of(recording / "cameras.yaml", tmp_path / "intrinsics.json")
-    found = load_cameras(tmp_path / "cam2base_extrinsics.json", known, recording)
-    np.testing.assert_allclose(found[serial].X_WC, X, atol=1e-9)
-    assert (found[serial].focal_y, found[serial].center_x) == (531.0, 640.0)
-    with pytest.raises(CameraError, match="has 2 entries, from RAIL"):
-        load_cameras(tmp_path / "cam2base_extrinsics.json", known, tmp_path)
-
+    lenses = {
+        "RAIL+1+2023": {serial: [1.0, 2.0, 3.0, 4.0]}, own: {serial: [530.0, 640.0, 531.0, 360.0]}
+    }  # fmt: skip
+    files = {"camera_intrinsics.json": json.dumps(lenses), "extrinsics.json": json.dumps(poses)}
     view = {"T0_ext1_in_world": inverse_pose(X).tolist(), "T1_ext2_in_world": np.eye(4).tolist()}
     lines = [{"episode_uuid": "RAIL+1+2023", **view}, {"episode_uuid": own, **view}]
     left = {"fx": 530.0, "fy": 531.0, "cx": 640.0, "cy": 360.0, "width": 1280, "height": 720}
@@ -229,11 +212,17 @@ def test_files_of_many_episodes_give_the_recordings_own(tmp_path):
     calibrated = [{"episode_uuid": "RAIL+1+2023", "cameras": {}}]
     calibrated += [{"episode_uuid": own, "cameras": cameras}]
     for name, records in (("extrinsics", lines), ("camera_intrinsics", calibrated)):
-        (tmp_path / f"{name}.jsonl").write_text("\n".join(map(json.dumps, records)) + "\n")
-    known = intrinsics_of(recording / "cameras.yaml", tmp_path / "camera_intrinsics.jsonl")
-    again = load_cameras(tmp_path / "extrinsics.jsonl", known, recording)
-    np.testing.assert_allclose(again[serial].X_WC, X, atol=1e-9)
-    assert again[serial].focal_y == 531.0
+        files[f"{name}.jsonl"] = "\n".join(map(json.dumps, records)) + "\n"
+    for name, text in files.items():
+        (tmp_path / name).write_text(text)
+    for suffix in ("json", "jsonl"):
+        given = tmp_path / f"camera_intrinsics.{suffix}", tmp_path / f"extrinsics.{suffix}"
+        known = intrinsics_of(recording / "cameras.yaml", given[0])
+        found = load_cameras(given[1], known, recording)[serial]
+        np.testing.assert_allclose(found.X_WC, X, atol=1e-9)
+        assert (found.focal_y, found.center_x) == (531.0, 640.0)
+        with pytest.raises(CameraError, match="has 2 entries, from RAIL"):
+            load_cameras(given[1], known, tmp_path)
 
 
 def test_what_is_wanted_is_said(tmp_path):
@@ -241,7 +230,6 @@ def test_what_is_wanted_is_said(tmp_path):
         ({"left": SIX}, ["has poses (left)", "--intrinsics FILE"]),
         (easy(), ["camera_color_optical_frame"]),
         ({"left": [*SIX[:3], 0.5, 0.5, 0.5, 0.9]}, ["camera 'left'", "length 1.25"]),
-        ({"left": {"X_WC": (2.0 * X).tolist()}}, ["camera 'left': the last row of the pose"]),
         ([{"extrinsic": PLAIN}, {"pose": X_LINK.tolist()}], ["2 poses without the names"]),
         ({"left": {"t": SIX[:3], "R": (1.2 * X[:3, :3]).tolist()}}, ["not a rotation"]),
         ({"rvecs": [[0.1, 0.2, 0.3], [1.0, 1.1, 1.2]]}, ["it has rvecs. Tried"]),
@@ -259,23 +247,13 @@ def test_the_recording_says_size_and_name_of_its_camera(tmp_path, kind):
     (tmp_path / "masks" / "front").mkdir(parents=True)
     cv2.imwrite(str(tmp_path / "masks" / "front" / "0.png"), np.zeros((720, 1280), np.uint8))
     K, path = [[640.0, 0.0, 639.5], [0.0, 642.0, 359.5], [0.0, 0.0, 1.0]], tmp_path / f"a.{kind}"
-    if kind == "npz":
-        np.savez(path, camera_matrix=K, dist_coeffs=np.zeros(5), T_base_cam=X)
-    elif kind == "opencv.json":
-        inverse = inverse_pose(X)
-        turned = {"R": inverse[:3, :3].tolist(), "T": inverse[:3, 3].tolist()}
-        path.write_text(json.dumps({"camera_matrix": K, **turned}))
-    else:
-        ends = f'<origin xyz="{SIX[:3]}" rpy="{SIX[3:]}"/>'.translate(
-            dict.fromkeys(map(ord, "[],"))
-        )
-        path.write_text(
-            '<robot name="arm"><link name="base"/><link name="front"/><joint name="j" type="fixed">'
-            f'<parent link="base"/><child link="front"/>{ends}</joint></robot>'
-        )
-    found = load_cameras(path, lambda: CameraFile({"front": CAMERA}, ()), tmp_path)
-    np.testing.assert_allclose(found["front"].X_WC, X, atol=1e-9)
-    front = found["front"]
+    X_CW = inverse_pose(X)
+    turned = {"camera_matrix": K, "R": X_CW[:3, :3].tolist(), "T": X_CW[:3, 3].tolist()}
+    given = {"camera_matrix": K, "dist_coeffs": np.zeros(5), "T_base_cam": X}
+    contents = {"npz": saved(np.savez, **given), "opencv.json": json.dumps(turned).encode()}
+    path.write_bytes(contents.get(kind, urdf(("base", "front", X)).encode()))
+    front = load_cameras(path, lambda: CameraFile({"front": CAMERA}, ()), tmp_path)["front"]
+    np.testing.assert_allclose(front.X_WC, X, atol=1e-9)
     assert (front.name, front.width, front.focal_y) == ("front", 1280, 642)
 
 

@@ -1,6 +1,7 @@
 """Readings of LeRobot's servos become the angles of a simulated arm with encoders."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -118,7 +119,7 @@ def test_readings_that_are_not_whole_steps_are_told_by_their_range(tmp_path):
     arm, angles = arm_of(5)
     servos = read_motors(write_file(tmp_path / "arm.json", arm), "so101_follower")
     log = log_of(arm, angles, "normalised", servos=servos)
-    smooth = JointLog(log.names, log.times, log.positions + 0.004, servos=servos)
+    smooth = replace(log, positions=log.positions + 0.004)
     found = map_arm(smooth)
     np.testing.assert_allclose(found.positions, angles, atol=3 * STEP)
     assert "could be degrees" in found.warnings[0]
@@ -128,14 +129,11 @@ def test_readings_that_are_not_whole_steps_are_told_by_their_range(tmp_path):
     for beyond, said in ((1.5, "could be degrees"), (2.5, "would leave its range")):
         readings = smooth.positions.copy()
         readings[3, j] = half + beyond
-        found = map_arm(JointLog(log.names, log.times, readings, servos=servos))
-        assert found.unit == "normalised"
-        assert said in found.warnings[0]
-    wide = angles.copy()
-    wide[3, 4] = 2.7
-    log = log_of(arm, wide, "deg", servos=servos)
-    smooth = JointLog(log.names, log.times, log.positions + 0.004, servos=servos)
-    assert map_arm(smooth).unit == "deg"
+        found = map_arm(replace(log, positions=readings))
+        assert (found.unit, said in found.warnings[0]) == ("normalised", True)
+    angles[3, 4] = 2.7
+    log = log_of(arm, angles, "deg", servos=servos)
+    assert map_arm(replace(log, positions=log.positions + 0.004)).unit == "deg"
 
 
 @pytest.mark.parametrize("mode", ["normalised", "deg"])
@@ -156,8 +154,6 @@ def test_a_robot_without_a_file_has_its_models_limits():
     known = JointLog(log.names, log.times, log.positions, servos=Servos("so100_follower"))
     found = map_arm(known)
     np.testing.assert_allclose(found.positions, angles[:12], atol=3 * STEP)
-    text = " ".join(found.warnings)
-    assert all(one in text for one in ("ranges of the motors of shoulder_pan", "--zeros all"))
 
 
 def test_degrees_of_old_data_sets_have_another_zero():

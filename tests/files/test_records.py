@@ -1,50 +1,37 @@
 """Records of frames, summaries and warnings, from given numbers."""
 
+import hashlib
 import math
+import time
 
 import numpy as np
 import pytest
+from pydrake.math import RigidTransform, RollPitchYaw
 
-from drake_pose.body import load_model
 from drake_pose.body.tree_kinematics import TreeKinematics
-from drake_pose.errors import weight_of
+from drake_pose.errors import OutputError, SettingsError, weight_of
 from drake_pose.files import records as rec
+from drake_pose.files.folder import write_summary
+from drake_pose.files.settings import SceneSettings
 from drake_pose.search import JointEstimate, PoseMode, PoseSet
-from tests.body.models import joint, link, urdf, write
+from tests.files.bodies import record, three_joints
 
 
 @pytest.fixture(scope="module")
 def model(tmp_path_factory):
-    """A model with an angle from 1 to 2 rad, a length from 3 to 3.4 m, and a continuous angle."""
-    parts = [link(name) for name in ("base", "arm", "slide", "wheel")]
-    parts += [
-        joint("weld", "fixed", "world", "base", limits=None),
-        joint("bend", "revolute", "base", "arm", limits='lower="1" upper="2"'),
-        joint("reach", "prismatic", "arm", "slide", limits='lower="3" upper="3.4"'),
-        joint("turn", "continuous", "slide", "wheel", limits=None),
-    ]
-    path = write(tmp_path_factory.mktemp("model"), urdf(*parts))
-    return load_model(path, check=False)
-
-
-def record(E_total=0.1, **more):
-    q = more.pop("q", np.zeros(3))
-    return rec.FrameRecord("a", q, None, E_total, 2.0, **more)  # type: ignore[arg-type]
+    return three_joints(tmp_path_factory.mktemp("model"))
 
 
 def test_intervals_end_at_limits_and_are_determined_below_half_the_range(model):
     q = np.array([1.9, 3.2, 3.0])
     told = rec.record_deviations(model, q, np.array([0.1, 0.06, 0.5]))
-    assert told["bend"]["determined"]
-    assert told["bend"]["low"] == pytest.approx(math.degrees(1.9 - 0.196))
-    assert told["bend"]["high"] == pytest.approx(math.degrees(2.0))
-    # 2 * 1.96 * .06 is more than half of .4.
-    assert not told["reach"]["determined"]
-    assert told["reach"]["low"] == pytest.approx(3.2 - 0.1176)
-    assert told["reach"]["high"] == pytest.approx(3.2 + 0.1176)
-    assert told["turn"]["determined"]
+    ends = {name: (one["low"], one["high"]) for name, one in told.items()}
+    assert ends["bend"] == pytest.approx(np.degrees([1.9 - 0.196, 2.0]))
+    assert ends["reach"] == pytest.approx((3.2 - 0.1176, 3.2 + 0.1176))
     # The interval of a continuous joint may go beyond half a turn.
-    assert told["turn"]["high"] == pytest.approx(math.degrees(3.98))
+    assert ends["turn"] == pytest.approx(np.degrees([3.0 - 0.98, 3.98]))
+    # 2 * 1.96 * .06 is more than half of .4.
+    assert [one["determined"] for one in told.values()] == [True, False, True]
     unknown = rec.record_deviations(model, q, np.full(3, np.nan))
     assert not any(one["determined"] for one in unknown.values())
     assert unknown["bend"]["low"] == pytest.approx(math.degrees(1.0))
@@ -64,14 +51,11 @@ def test_measured_position_is_estimate_minus_error_within_limits(model):
 
 
 def test_base_columns_and_pose_are_inverse():
-    X_WB = np.eye(4)
-    X_WB[:3, :3] = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
-    X_WB[:3, 3] = [0.1, -0.2, 0.3]
-    np.testing.assert_allclose(rec.base_pose(rec.base_cells(X_WB)), X_WB, atol=1e-8)
-    np.testing.assert_array_equal(rec.base_pose(None), np.eye(4))
+    X_WB = RigidTransform(RollPitchYaw(0.3, -2.0, 1.0), np.array([0.1, -0.2, 0.3])).GetAsMatrix4()
     # The quaternion need not be normalised.
     longer = rec.base_cells(X_WB) * [1.0, 1.0, 1.0, *[1.01] * 4]
     np.testing.assert_allclose(rec.base_pose(longer), X_WB, atol=1e-8)
+    np.testing.assert_array_equal(rec.base_pose(None), np.eye(4))
 
 
 def test_summary_counts_and_averages_frames_with_a_pose():
@@ -118,11 +102,17 @@ def test_warning_of_a_bad_fit_names_joints_at_limits_and_held_ones(model):
         return rec.poor_fit_warnings(known, model, ["reach"])
 
     assert not told(2.0, 0.249)
-    assert weight_of(told(2.0, 0.25)[0]) == "wrong"
-    assert "(bend at a limit)" in told(2.0, 0.25)[0]
-    assert "(bend at a limit)" in told(1.0005, 0.4)[0]
-    assert "at a limit" not in told(1.5, 0.4)[0]
-    assert "the held positions (reach)" in told(1.5, 0.4)[0]
+    for bend, error in ((2.0, 0.25), (1.0005, 0.4), (1.5, 0.4)):
+        (text,) = told(bend, error)
+        assert ("(bend at a limit)" in text) == ("limit)" in text) == (bend != 1.5)
+        assert (weight_of(text), "held positions (reach)" in text) == ("wrong", True)
+    # Half of the bad frames at a limit is not most; frames of the method person do not count.
+    q = [np.array([2.0 - 0.1 * (k % 2), 3.2, 0.0]) for k in range(5)]
+    some = {f"{k}": record(0.1 * k, q=q[k]) for k in range(5)}
+    some["6"] = record(0.9, inlier_ratio=0.2)
+    (text,) = rec.poor_fit_warnings(some, model, [])
+    assert "frame 3-4 (of 5, E_total 35.00 %)" in text
+    assert "limit)" not in text
 
 
 def test_modes_of_a_frame_are_united_in_user_units(model):
@@ -174,3 +164,74 @@ def test_pose_sets_are_recorded_with_values_of_each_mode(model):
             assert (one[name]["low"], one[name]["high"]) == pytest.approx((0.1 * unit, 0.4 * unit))
             assert one[name]["value"] == (None if value is None else pytest.approx(value))
     assert rec.record_pose_set(None, tree) == {}
+
+
+def test_jobs_name_the_digests_of_their_files(tmp_path):
+    for name, content in (("model.urdf", b"a"), ("cameras.yaml", b"b"), ("mine.yaml", b"c")):
+        (tmp_path / name).write_bytes(content)
+    given = tmp_path, tmp_path / "model.urdf", SceneSettings(every=2)
+    digests = [hashlib.sha256(one).hexdigest() for one in (b"a", b"b", b"c")]
+    for cameras, used in (
+        (None, digests[1]),
+        (tmp_path / "mine.yaml", digests[2]),
+        (tmp_path / "no", None),
+    ):
+        job = rec.describe_job(*given, cameras)
+        assert job["sha256"] == {"model": digests[0], "cameras": used}
+        assert (job["scene"], job["settings"]["every"]) == (str(tmp_path), 2)
+    assert {"drake_pose", "python", "drake", "numpy"} <= {*rec.versions()}
+
+
+def test_summaries_of_running_jobs_take_a_twentieth_of_the_time():
+    for spent, wait in ((0.0, 2.0), (0.05, 2.0), (1.0, 20.0)):
+        now = time.monotonic()
+        assert rec.next_summary(now - spent) == pytest.approx(now + wait, abs=0.5)
+
+
+def test_appended_rows_are_on_disk_and_read_back(tmp_path):
+    base, q = np.array([1.0, 2.0, 3.0, 1.0, 0.0, 0.0, 0.0]), np.array([0.5, -1.25])
+    rows = [rec.FrameRecord("0001", q, base, 0.25, 1.5)]
+    rows += [rec.FrameRecord("0002", np.full(2, np.nan), None, None, 1.5)]
+    for with_base, cells in ((False, ""), (True, ",1,2,3,1,0,0,0")):
+        table = rec.PoseTable(tmp_path, ("a", "b"), with_base)
+        table.write([])
+        for row in rows:
+            table.append(row)
+        header, *lines = (tmp_path / "poses.csv").read_text().splitlines()
+        assert header.split(",") == table.header
+        lost = f"0002,{',' * (2 + 7 * with_base)},1.5000"
+        assert lines == [f"0001,0.5,-1.25{cells},0.25,1.5000", lost]
+        # An incomplete last row is dropped.
+        with (tmp_path / "poses.csv").open("a") as file:
+            file.write("0003,0.5,")
+        first, second = table.read()
+        assert (first.base is not None and first.base.tolist() == base.tolist()) is with_base
+        assert (first.found, second.found, second.base) == (True, False, None)
+        assert table.read({"0001": {"E_total": 0.5, "seconds": 1.0}})[0].E_total == 0.5
+    for text, message in (
+        ("frame,a,c,error,seconds\n", "another model"),
+        ("frame,a,b,error,seconds\n1,2\n", "line 2 has 2 columns"),
+        ("frame,a,b,error,seconds\n1,x,2,3,4\n", "line 2 is damaged"),
+    ):
+        (tmp_path / "poses.csv").write_text(text)
+        with pytest.raises(OutputError, match=message):
+            rec.PoseTable(tmp_path, ("a", "b"), False).read()
+    assert rec.PoseTable(tmp_path / "none", ("a", "b"), False).read() == []
+
+
+def test_only_the_same_job_is_resumed(tmp_path):
+    settings = {"interval": 20.0, "frames": ["0000"]}
+    job = {"sha256": {"model": "m", "cameras": "c"}, "settings": settings}
+    assert rec.read_earlier_summary(tmp_path, job, resume=False) is None
+    with pytest.raises(SettingsError, match="needs the folder"):
+        rec.read_earlier_summary(None, job, resume=True)
+    write_summary(tmp_path, job)
+    other_frames = {"settings": settings | {"frames": []}}
+    assert rec.read_earlier_summary(tmp_path, job | other_frames, resume=True) == job
+    for other, message in (
+        ({"sha256": {"model": "m", "cameras": "d"}}, "with another cameras file"),
+        ({"sha256": {"model": "n", "cameras": "c"}}, "with another model file"),
+        ({"settings": settings | {"interval": 9.0}}, r"with interval = 20\.0, not 9\.0"),
+    ):
+        with pytest.raises(OutputError, match=message):
+            rec.read_earlier_summary(tmp_path, job | other, resume=True)

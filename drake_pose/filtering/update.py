@@ -223,8 +223,8 @@ def update(
         measurement: y, its noise, and the observation h.
         iterations: largest number of linearisations.
         start: (n,) point of the first linearisation; None: the predicted mean.
-        tempered: whether the first iterations use inflated noise if the start fits badly. Not for a
-            mirrored start, which inflated noise would draw back to the prediction.
+        tempered: whether noise is inflated at first if the start fits badly; only of several
+            iterations, without ``remainder_weight``. Not for a mirrored start, which it would move.
         truncate: maps a belief and initial sites (S, 2) to the truncated belief; None: no limits.
         sites: (S, 2) sites of the last truncation; None: none.
         remainder_weight: 0: linearise at a point. Otherwise linearise over the belief (unless

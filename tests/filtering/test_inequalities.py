@@ -1,6 +1,3 @@
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 
@@ -18,15 +15,13 @@ from drake_pose.filtering.inequalities import (
     two_sided,
 )
 from tests.body.models import joint, link, urdf, write
-from tests.written_files import assert_same_files
 
-HAND = bundled_model("two_finger_hand")
 DEGREE = np.pi / 180.0
 
 
 def test_rows_of_the_hand_are_its_limits_and_those_of_table_1():
     """Of Shimada et al.: 3 differences of flexions, 7 of lengths. The palm has no limits."""
-    hand = load_model(HAND)
+    hand = load_model(bundled_model("two_finger_hand"))
     rows, limits = model_inequalities(hand), from_model(hand)
     assert rows.rows[: len(limits)] == limits.rows
     assert len(limits) == 2 * (len(hand.position_names) - 7)
@@ -169,10 +164,3 @@ def test_invalid_couplings_files_are_refused_by_name(tmp_path, text, words):
 def test_invalid_arrays_are_refused_by_name(make, word):
     with pytest.raises((SettingsError, UnknownNameError), match=word):
         make()
-
-
-def test_the_hands_files_equal_its_scripts_output(tmp_path):
-    script = HAND.parent / "make_two_finger_hand.py"
-    subprocess.run([sys.executable, str(script), "--out", str(tmp_path)], check=True)
-    assert len(list(tmp_path.iterdir())) == 2
-    assert_same_files(tmp_path, HAND.parent)

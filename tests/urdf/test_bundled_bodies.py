@@ -63,7 +63,7 @@ def load(name):
     return load_model(URDF / f"{name}.urdf", check=False)
 
 
-@pytest.mark.parametrize("name", [*BODIES, "hand", "person"])
+@pytest.mark.parametrize("name", [*BODIES, "hand", "person", "two_finger_hand"])
 def test_script_writes_the_committed_files(name, tmp_path):
     by_hand = {Path("landmarks.yaml")} if name in BODIES else set()
     assert set(written_again(name, tmp_path)) == set(committed(name)) - by_hand

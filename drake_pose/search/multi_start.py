@@ -130,9 +130,8 @@ class MultiStartSearch:
     def with_time_limit(self, seconds: float) -> "MultiStartSearch":
         """Return the same search with a time limit of a match [s]; a shorter own limit is kept."""
         other = copy.copy(self)
-        other._time_limit = min(
-            seconds, math.inf if other._time_limit is None else other._time_limit
-        )
+        limits = [one for one in (seconds, self._time_limit) if one is not None]
+        other._time_limit = min(limits)
         return other
 
     def match(self, views: Sequence[View], root_position: np.ndarray | None = None) -> PoseEstimate:

@@ -22,7 +22,7 @@ from drake_pose.fit.kernel import assemble_normal_equations
 from drake_pose.fit.levenberg_marquardt import Equations, StepSettings, damped_step
 from drake_pose.fit.parameters import BodyParameters, Placement
 from drake_pose.fit.raster_lines import Border, compare_raster, find_body_border, find_border
-from drake_pose.search.estimates import View, require_views
+from drake_pose.search.estimates import View
 from drake_pose.silhouette.outline import PackedSurfaces, TreeSurfaces
 from drake_pose.silhouette.scoring import draw_packed
 
@@ -154,18 +154,14 @@ class RefinementProblem:
 
     Args:
         body: the body.
-        views: the silhouettes, one per camera.
+        views: the silhouettes, one per camera; at least one.
 
     Attributes:
         area: total area of the silhouettes [pixel].
         border_length: approximate length of their borders [pixel].
-
-    Raises:
-        SettingsError: if there is no view.
     """
 
     def __init__(self, body: RefinementBody, views: Sequence[View]) -> None:
-        require_views(views)
         self.body, self.views = body, tuple(views)
         self.area = float(sum(np.count_nonzero(view.mask) for view in views))
         self._silhouettes = [find_border(view.mask) for view in views]

@@ -51,7 +51,7 @@ def sliders(tmp_path_factory):
         # 12.6 % of the mean of 200 and 48 pixels is 15.6; the wide box has 56 pixels outside, so
         # the threshold is doubled twice. The wide box is placed three times.
         (np.s_[46:54, 41:59], {}, (0.126 * 124 * 4, 1 + 1 + 2, "end")),
-        (np.s_[46:54, 41:59], {"run_limit": 2}, (0.126 * 124 * 2, 2, "end")),
+        (np.s_[46:54, 41:59], {"run_limit": 2}, (0.126 * 124 * 2, 2, "run_limit")),
         (np.s_[46:54, 41:59], {"run_limit": 3}, (0.126 * 124 * 4, 3, "run_limit")),
         (np.s_[2:4, 2:4], {"outside_limit": 0.0}, (0.0, 1, "end")),
     ],

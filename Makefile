@@ -44,11 +44,13 @@ DATA ?= $(wildcard ../shared/data)
 bench: export OPENBLAS_NUM_THREADS = 1
 bench: $(VENV)/ready-cluster
 	$(PYTHON) -m tests.benchmarks.speed
-	$(PYTHON) -m tests.benchmarks.growth
 	$(PYTHON) -m tests.benchmarks.filters
+	$(PYTHON) -m tests.benchmarks.seeds
 	$(PYTHON) -m tests.benchmarks.silhouette_camera
 	$(PYTHON) -m tests.benchmarks.estimates $(DATA)
 	$(if $(DATA),$(PYTHON) -m tests.benchmarks.registration $(DATA) --cases 1)
+	$(if $(DATA),$(PYTHON) -m tests.benchmarks.episodes $(DATA) --rooms 1 --spoilt --only SO-101)
+	$(if $(DATA),$(PYTHON) -m tests.benchmarks.wrists $(DATA) --only textured)
 	$(PYTHON) -m tests.benchmarks.memory
 	$(PYTHON) -m tests.benchmarks.cluster
 

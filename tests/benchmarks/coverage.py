@@ -1,10 +1,9 @@
 """Benchmark of intervals: the fraction that covers the truth, and their widths.
 
 Run as ``python -m tests.benchmarks.coverage DATA [--draws N] [--only TEXT]``; DATA is a folder
-with ``franka_one_view/panda`` (Drake renders sequences of this arm), ``arm_two_views`` and
-``hand_sequences``. Intervals are read from ``joints.csv``, and lost frames from ``summary.json``.
-A frame is wrong without warning if a true joint position lies more than 10 degrees, or 5 cm,
-outside its interval.
+with ``franka_one_view/panda`` (Drake renders sequences of this arm) and ``arm_two_views``. A frame
+is wrong without warning if a true joint position lies more than 10 degrees, or 5 cm, outside its
+interval.
 """
 
 import argparse
@@ -38,7 +37,6 @@ Damage = Callable[[Mask, np.random.Generator, int], Mask]
 _FRAMES, _RATE_HZ, _FASTEST = 24, 30.0, 2.0
 _WRONG_DEGREES, _WRONG_METRES = 10.0, 0.05
 _PANDA, _LBR = "franka_one_view/panda/panda.urdf", "arm_two_views"
-_ARM_JOINTS, _HAND_JOINTS = ("panda_joint", "A"), ("index_", "middle_", "ring_", "little_")
 # Image shift caused by the orientation error of cameras [pixel].
 _CAMERAS_OFF = 1.4
 
@@ -52,7 +50,6 @@ class CoverageSet(NamedTuple):
     joints: tuple[str, ...]  # Prefixes of the names of evaluated joints.
     settings: EstimateSettings = EstimateSettings()
     draws: int | None = None  # Maximum number of scenes; None: as given on the command line.
-    in_degrees: bool = False  # Whether the true angles are in degrees.
 
 
 class Evaluation(NamedTuple):
@@ -72,30 +69,23 @@ def coverage_sets(data: Path) -> Iterator[CoverageSet]:
         yield CoverageSet(
             f"person, sequence, four views, {name}", person, _draw_person(damage), ("",), draws=1
         )
-    panda = data / _PANDA
-    for name, damage in _damages():
-        make = _draw_arm(panda, damage)
-        yield CoverageSet(f"arm, sequence, {name}", panda, make, _ARM_JOINTS[:1])
-    make = _draw_arm(panda, cameras_off=_CAMERAS_OFF)
-    yield CoverageSet(f"arm, sequence, cameras {_CAMERAS_OFF} px off", panda, make, ("panda_",))
-    make = _draw_arm(panda, colours=True)
-    yield CoverageSet("arm, sequence by colour", panda, make, _ARM_JOINTS[:1])
-    make = _draw_arm(panda, _half_hidden)
-    yield CoverageSet("arm, sequence, half hidden for 8 frames", panda, make, ("panda_",))
+    panda, moving = data / _PANDA, EstimateSettings()
     stills = EstimateSettings(track=False, frames=("0000:0005",))
-    make = _draw_arm(panda, _with_ragged_edges)
-    yield CoverageSet("arm, stills, edges 1.5 px off", panda, make, ("panda_",), stills)
-    make = _draw_arm(panda, views=1)
-    yield CoverageSet("arm, stills, one view, exact masks", panda, make, ("panda_",), stills)
+    arms = [(f"sequence, {name}", _draw_arm(panda, one), "panda_joint", moving)
+            for name, one in _damages()]  # fmt: skip
+    off = f"sequence, cameras {_CAMERAS_OFF} px off"
+    arms += [
+        (off, _draw_arm(panda, cameras_off=_CAMERAS_OFF), "panda_", moving),
+        ("sequence by colour", _draw_arm(panda, colours=True), "panda_joint", moving),
+        ("sequence, half hidden for 8 frames", _draw_arm(panda, _half_hidden), "panda_", moving),
+        ("stills, edges 1.5 px off", _draw_arm(panda, _with_ragged_edges), "panda_", stills),
+        ("stills, one view, exact masks", _draw_arm(panda, views=1), "panda_", stills),
+    ]
+    for name, make, joints, settings in arms:
+        yield CoverageSet(f"arm, {name}", panda, make, (joints,), settings)
     arm = data / _LBR
     model = arm / "med7" / "med7.urdf"
-    yield CoverageSet("real arm, stills", model, lambda _, k: arm, _ARM_JOINTS[1:], draws=1)
-    for scene in sorted(data.glob("hand_sequences/*/scene.yaml")):
-        model = bundled_model("hand").with_name("right_hand.urdf")
-        yield CoverageSet(
-            f"hand, {scene.parent.name}", model, lambda _, k, own=scene.parent: own, _HAND_JOINTS,
-            draws=1, in_degrees=True,
-        )  # fmt: skip
+    yield CoverageSet("real arm, stills", model, lambda _, k: arm, ("A",), draws=1)
 
 
 def _damages() -> Iterator[tuple[str, Damage]]:
@@ -234,9 +224,8 @@ def _with_orientation_error(
     return replace(camera, X_WC=X_WC)
 
 
-def evaluate_result(out: Path, scene: Path, joints: Sequence[str], in_degrees: bool) -> Evaluation:
+def evaluate_result(out: Path, scene: Path, joints: Sequence[str]) -> Evaluation:
     """Return the intervals in a result's files, compared with the scene's truth."""
-    unit = 1.0 if in_degrees else np.degrees(1.0)
     truth = true_positions(scene)
     frames = json.loads((out / "summary.json").read_text())["frames"]
     lost = {name for name, one in frames.items() if not one["found"]}
@@ -246,7 +235,7 @@ def evaluate_result(out: Path, scene: Path, joints: Sequence[str], in_degrees: b
         if true is None or not row["joint"].startswith(tuple(joints)) or row["frame"] in lost:
             continue
         is_angle = "position_" not in row["joint"] and "finger" not in row["joint"][:12]
-        value = unit * true if is_angle else true
+        value = np.degrees(true) if is_angle else true
         low, high = float(row["low"]), float(row["high"])
         inside.append(low <= value <= high)
         determined.append(row["determined"] == "yes")
@@ -277,7 +266,7 @@ def measure(one: CoverageSet, draws: int, folder: Path) -> list[Evaluation]:
         place = folder / f"{one.name} {draw}".replace("/", " ")
         scene, out = one.make(place / "scene", draw), place / "out"
         estimate_scene(scene, one.model, out, one.settings, replay=False, overlay=False)
-        results.append(evaluate_result(out, scene, one.joints, one.in_degrees))
+        results.append(evaluate_result(out, scene, one.joints))
     return results
 
 

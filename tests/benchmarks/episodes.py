@@ -116,12 +116,7 @@ class Outcome(NamedTuple):
 def measure_episode(data: Path, name: str, folder: Path, seed: int, kind: EpisodeSet) -> Outcome:
     """Simulate an episode with errors, and find its camera.
 
-    Args:
-        data: folder of the models.
-        name: of the arm, a key of ARMS.
-        folder: folder for the files.
-        seed: seed of the episode.
-        kind: errors of the episode.
+    data: folder of the models. name: of the arm, a key of ARMS. folder: for the files.
     """
     rng = np.random.default_rng([10, seed])
     arm, path = ARMS[name], data / ARMS[name].file

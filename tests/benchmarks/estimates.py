@@ -18,14 +18,12 @@ from drake_pose.body import bundled_model, load_model
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.jobs.demo import demo_settings, stored_scene
 from drake_pose.jobs.estimate.scene import estimate_scene
-from drake_pose.papers.kameda import continuous_figures, experiment_tree, run_experiment
-from drake_pose.search import MultiStartSearch
 from drake_pose.silhouette.pictures.scenes import load_scene
 from tests.benchmarks.coverage import draw_scene, true_positions
 from tests.benchmarks.speed import measure_kernel
 from tests.benchmarks.tables import print_table
 
-_FRAMES, _IMAGES = 24, 20
+_FRAMES = 24
 _RIGHT_HAND = bundled_model("hand").with_name("right_hand.urdf")
 _ARM_JOINTS = ("A1", "A2", "A3", "A4")
 _FLEXIONS = tuple(
@@ -109,17 +107,6 @@ def _rows(data: Path | None, folder: Path) -> Iterator[tuple[str, ...]]:
     for work in works(data, folder):
         seconds, E_total, error = measure(work)
         yield work.name, f"{seconds:.3f} s", f"{seconds / label_image:.0f}", f"{E_total:.2%}", error
-    plain = continuous_figures(
-        run_experiment(MultiStartSearch(experiment_tree(), exact_masks=True), _IMAGES, seed=1)
-    )
-    seconds = plain["median_seconds"] + plain["mean_interval_seconds"]
-    yield (
-        "continuous angles, one view, exact masks",
-        f"{seconds:.3f} s",
-        f"{seconds / label_image:.0f}",
-        f"{plain['median_e_total']:.2%}",
-        f"intervals hold {plain['interval_coverage']:.0%}, {plain['determined']:.0%} determined",
-    )
 
 
 def _hand_rows(data: Path) -> Iterator[tuple[str, ...]]:

@@ -50,7 +50,6 @@ SECTIONS: dict[str, tuple[str, ...]] = {
     "speed": (
         "python -m tests.benchmarks.speed",
         "python -m tests.benchmarks.silhouette_camera",
-        "python -m tests.benchmarks.growth",
     ),
     "memory": ("python -m tests.benchmarks.memory",),
     "cluster": ("python -m tests.benchmarks.cluster",),
@@ -69,31 +68,26 @@ def to_markdown(printed: str) -> str:
     A title, which rich centres above its table, becomes a bold line. Text outside tables is left
     out. Cells that rich broke over several lines are joined.
     """
-    found, rows, before, is_head = list[str](), list[list[str]](), list[str](), False
-    for line in printed.splitlines():
-        text = line.strip()
-        if not text or text[0] not in "┏┃┡│└├":
-            before.append(text)
-            continue
-        if text[0] == "┏":
+    found, rows, before = list[str](), list[list[str]](), list[str]()
+    for text in map(str.strip, printed.splitlines()):
+        mark = text[:1]
+        if mark == "┏":
             # Rich breaks a long title in two lines; more lines are something else.
             title = " ".join(before if len(before) < 3 else before[-1:])
-            rows, is_head, before = [], True, []
-        elif text[0] in "┃│":
+            rows, before = [], []
+        elif mark and mark in "┃│":
             cells = [cell.strip() for cell in re.split("[┃│]", text)[1:-1]]
-            if not is_head and rows and not cells[0] and len(rows) > 1:
+            # A head, or a cell of the first column, continues in the next line.
+            if rows and (mark == "┃" or (not cells[0] and len(rows) > 1)):
                 rows[-1] = [f"{a} {b}".strip() for a, b in zip(rows[-1], cells, strict=True)]
-            elif is_head and rows:
-                rows[0] = [f"{a} {b}".strip() for a, b in zip(rows[0], cells, strict=True)]
             else:
                 rows.append(cells)
-        elif text[0] == "┡":
-            is_head = False
-        elif text[0] == "└" and rows:
+        elif mark == "└" and rows:
             head, *body = (f"| {' | '.join(row)} |" for row in rows)
             rule = "|" + " --- |" * len(rows[0])
             found.append("\n".join([*([f"**{title}**\n"] if title else []), head, rule, *body]))
-            rows = []
+        elif not mark or mark not in "┡├":
+            before.append(text)
     return "\n\n".join(found)
 
 

@@ -161,11 +161,8 @@ def measure_camera(
 ) -> CameraOutcome:
     """Simulate an arm and find its camera.
 
-    Args:
-        body: the arm.
-        seed: seed of the poses and the camera.
-        damaged_case: damage the masks, and make one frame's positions wrong.
-        model_errors: give joints, link scales and lens small errors.
+    damaged_case: damage the masks, and make one frame's positions wrong. model_errors: give joints,
+    link scales and lens small errors.
     """
     rng = np.random.default_rng(seed)
     true = _with_other_lengths(body, rng) if model_errors else body

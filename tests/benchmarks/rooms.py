@@ -1,6 +1,5 @@
 """Simulated episodes of arms in rooms, rendered by Drake."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -103,14 +102,10 @@ class Room:
         if colour is not None:
             engine.default_diffuse = np.array([*colour, 1.0])
         self._scene_graph.AddRenderer("vtk", MakeRenderEngineVtk(engine))
-        self._furnish()
         self._plant.Finalize()
         self._source = source
         self._context = self._plant.CreateDefaultContext()
         self._scene_context = self._scene_graph.CreateDefaultContext()
-
-    def _furnish(self) -> None:
-        """Add to the plant before it is finalized."""
 
     def _wall(self, source, place, size, texture, colour=(1.0, 1.0, 1.0)) -> None:
         properties = PerceptionProperties()
@@ -188,7 +183,6 @@ def simulate(
     seed: int,
     grey: bool = False,
     late: float = 0.0,
-    moved: Callable[[int], Array] | None = None,
     distance: tuple[float, float] = (1.1, 1.7),
     middle: tuple[float, float, float] = (0.0, 0.0, 0.4),
     small: bool = False,
@@ -197,8 +191,6 @@ def simulate(
 
     Args:
         late: how late the pictures are [s].
-        moved: returns the pose (4, 4) of the camera that takes picture k in the returned one;
-            None: it stands still.
         distance: bounds of the camera's distance from the point that it looks at [m].
         middle: this point (x, y, z) in the world [m], half as high as the arm is.
         small: whether the arm is about 50 pixels tall, in pictures of a quarter of the size.
@@ -238,12 +230,11 @@ def simulate(
     room, angles = Room(model, folder, seed, grey, behind), behind + rng.uniform(-1.6, 1.6, 3)
     walk = rng.uniform(1.0, 2.2, (3, 1)) * np.column_stack([np.cos(angles), np.sin(angles)])
     pictures = []
-    for n, (t, q) in enumerate(zip(times, at(times + late), strict=True)):
+    for t, q in zip(times, at(times + late), strict=True):
         progress = t / times[-1] * 2.0
         k = min(int(progress), 1)
         place = walk[k] + (progress - k) * (walk[k + 1] - walk[k])
-        own = camera if moved is None else camera.with_pose(camera.X_WC @ moved(n))
-        picture = room.picture(q, [place[0], place[1], progress], own)
+        picture = room.picture(q, [place[0], place[1], progress], camera)
         noisy = picture + rng.normal(0.0, _NOISE, picture.shape)
         pictures.append(np.clip(noisy, 0, 255).astype(np.uint8))
     return SimulatedEpisode(np.array(pictures), times, log_times, at(log_times), camera)

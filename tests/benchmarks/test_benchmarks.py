@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from drake_pose.commands.main import app
-from tests.benchmarks import figures, memory, registration
+from tests.benchmarks import figures, registration
 from tests.benchmarks.tables import print_table
 
 
@@ -17,12 +16,6 @@ def test_pose_errors_are_recovered():
     found[:3, 3] -= [0.1, 0.2, 0.3]
     expected = [0.01, -0.02, 0.03, 0.1, 0.2, 0.3]
     np.testing.assert_allclose(registration.pose_error(found, true), expected, atol=1e-12)
-
-
-def test_commands_of_the_benchmark_exist():
-    for line in memory.COMMANDS:
-        # Parse without running; an unknown option raises.
-        app.parse_args(line.split(), exit_on_error=False, print_error=False)
 
 
 def test_printed_tables_become_markdown(capsys, monkeypatch):

@@ -15,8 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydrake.geometry import Box
-from pydrake.math import RigidTransform
 from scipy.spatial.transform import Rotation
 
 from drake_pose.arrays import Array
@@ -63,14 +61,13 @@ GRIPPERS = {
 
 
 class WristRoom(Room):
-    """A room with a table and things on it, and a thing that the hand may hold."""
+    """A room with a table and things on it."""
 
     def __init__(
         self, model: ArticulatedModel, gripper: Gripper, folder: Path, seed: int, *,
-        held: bool, contrast: float, things: int,
+        contrast: float, things: int,
     ) -> None:  # fmt: skip
-        """Build the room; held, contrast, things: as of ``simulate_wrist``."""
-        self._gripper, self._held = gripper, held
+        """Build the room; contrast, things: as of ``simulate_wrist``."""
         grey = np.random.default_rng([14, seed]).choice([0.1, 0.3, 0.6, 0.9])
         colour = (grey, grey, grey)
         super().__init__(model, folder, seed, colour=colour, grey=False, behind=0.0, near=0.01)
@@ -89,14 +86,6 @@ class WristRoom(Room):
             self._wall(source, place, size, None, rng.uniform(0, 1, 3))
         self._scene_context = self._scene_graph.CreateDefaultContext()
 
-    def _furnish(self) -> None:
-        """Put a thing between the fingers."""
-        if self._held:
-            one, link = self._gripper, self._plant.GetBodyByName(self._gripper.link)
-            colour = [*self._rng.uniform(0, 1, 3), 1.0]
-            place = RigidTransform(one.reach * np.array(one.axis))
-            self._plant.RegisterVisualGeometry(link, place, Box(0.015, 0.03, 0.05), "held", colour)
-
 
 def mount(
     rng: np.random.Generator, model: ArticulatedModel, one: Gripper, width: int, height: int
@@ -105,15 +94,11 @@ def mount(
 
     The gripper covers 6 to 45 % of its picture, and its fingers move in 1 % or more.
     """
-    link = model.plant.GetBodyByName(one.link)
-    context, shown = model.plant.CreateDefaultContext(), []
-    for part in (0.0, 0.9):
-        q = model.default_positions.copy()
-        for joint, value in one.arm.items():
-            q[model.position_index(joint)] = value
-        for joint, (low, high) in one.fingers.items():
-            q[model.position_index(joint)] = low + part * (high - low)
-        shown.append(q)
+    link, context = model.plant.GetBodyByName(one.link), model.plant.CreateDefaultContext()
+    shown = np.tile(model.default_positions, (2, 1))
+    shown[:, [model.position_index(joint) for joint in one.arm]] = [*one.arm.values()]
+    for joint, (low, high) in one.fingers.items():
+        shown[:, model.position_index(joint)] = low, low + 0.9 * (high - low)
     model.plant.SetPositions(context, shown[0])
     X_WL = link.EvalPoseInWorld(context).GetAsMatrix4()
     while True:
@@ -148,16 +133,12 @@ def _random_mount(rng: np.random.Generator, one: Gripper, width: int, height: in
 
 def simulate_wrist(
     data: Path, folder: Path, one: Gripper, seed: int, *, contrast: float = 0.6, things: int = 14,
-    held: bool = False, motion: str = "free",
+    motion: str = "free",
 ) -> tuple[ArticulatedModel, SimulatedEpisode]:  # fmt: skip
     """Simulate an episode of 12 s, its clock 30 ms late, with a camera at X_LC on a gripper's link.
 
-    Args:
-        data: folder of the models.
-        one: the arm and its gripper.
-        contrast, things: of the table's texture, 0.02: a faint grain; number of boxes on it.
-        held: whether the hand holds a thing.
-        motion: "free": all joints swing; "upright": the hand turns about the vertical only.
+    contrast: of the table's texture. things: number of boxes on it. motion: "free", or "upright":
+    the hand turns about the vertical only.
     """
     rng = np.random.default_rng([13, seed])
     model, (width, height) = load_model(data / one.file, check=False), (320, 240)
@@ -175,15 +156,13 @@ def simulate_wrist(
         q = np.tile(model.default_positions, (len(times), 1))
         q[:, arm] = middle + amplitude * np.sin(phase + rate * times[:, None])
         part = 0.5 + 0.5 * np.sin(closing[0] * times + closing[1])
-        if held:
-            part = 0.35 + 0.0 * part
         for joint, (low, high) in one.fingers.items():
             q[:, model.position_index(joint)] = low + part * (high - low)
         return q
 
     times = np.arange(60) / 5.0
     log_times = np.arange(-1.0, times[-1] + 1.0, 1.0 / LOG_HZ)
-    room = WristRoom(model, one, folder, seed, held=held, contrast=contrast, things=things)
+    room = WristRoom(model, one, folder, seed, contrast=contrast, things=things)
     context, pictures = model.plant.CreateDefaultContext(), []
     for q in at(times + 0.03):
         model.plant.SetPositions(context, q)
@@ -202,30 +181,22 @@ class Kind:
     name: str
     room: dict[str, Any] = field(default_factory=dict)  # Arguments of ``simulate_wrist``.
     wrong: str = ""  # What is wrong: "joints" or "mirrored"; "": nothing.
-    right: bool = True  # Whether a pose is to be accepted.
-    arms: tuple[str, ...] = tuple(GRIPPERS)
 
 
 FEW = {"contrast": 0.1, "things": 4}
 KINDS = (
     Kind("textured table, 14 things"),
-    Kind("textured table, a thing held", {"held": True}, arms=("so101",)),
     Kind("textured table, hand turns about the vertical", {"motion": "upright"}),
     Kind("faint table, 4 things", FEW),
-    Kind("textured table, joints of another episode", wrong="joints", right=False),
-    Kind("textured table, mirrored pictures", wrong="mirrored", right=False),
+    Kind("textured table, joints of another episode", wrong="joints"),
+    Kind("textured table, mirrored pictures", wrong="mirrored"),
 )
 
 
 def decide(data: Path, name: str, kind: Kind, seed: int, codec: str) -> Outcome:
     """Simulate an episode of an arm, spoil it as the kind says, and register its camera.
 
-    Args:
-        data: folder of the models.
-        name: of the arm, a key of GRIPPERS.
-        kind: of the episode.
-        seed: of the episode.
-        codec: as of ``write_episode``.
+    data: folder of the models. name: of the arm, a key of GRIPPERS. codec: of ``write_episode``.
     """
     one = GRIPPERS[name]
     path = data / one.file
@@ -255,8 +226,6 @@ def _rows(data: Path, first: int, only: str) -> Iterator[list[str]]:
             continue
         found = list[Outcome]()
         for m, name in enumerate(GRIPPERS):
-            if name not in kind.arms:
-                continue
             seed = first + len(GRIPPERS) * n + m
             found.append(decide(data, name, kind, seed, "libx264" if seed % 2 else ""))
             print(kind.name, name, seed, found[-1], flush=True)
@@ -268,8 +237,8 @@ def _rows(data: Path, first: int, only: str) -> Iterator[list[str]]:
         yield [
             kind.name,
             f"{len(accepted)} of {len(found)}",
-            "; ".join(off) if kind.right and off else "-",
-            f"{sum(one.inside for one in accepted)} of {6 * len(accepted)}" if kind.right else "-",
+            "; ".join(off) if off and not kind.wrong else "-",
+            "-" if kind.wrong else f"{sum(k.inside for k in accepted)} of {6 * len(accepted)}",
             f"{np.median([one.seconds for one in found]):.0f}",
         ]
 

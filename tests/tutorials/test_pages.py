@@ -32,6 +32,7 @@ PAGES = sorted(
 TEXTS = {page.relative_to(ROOT).as_posix(): page.read_text(encoding="utf-8") for page in PAGES}
 # Those that show how the program is used.
 SHOWN = {name: text for name, text in TEXTS.items() if not name.startswith("urdf/")}
+NOTEBOOKS = sorted(TUTORIALS.glob("*.ipynb"))
 ENVIRONMENT = {"COLUMNS": "200", "NO_COLOR": "1", "TERM": "dumb"}
 
 each_page = pytest.mark.parametrize("page", TEXTS)
@@ -117,7 +118,7 @@ def python_sources() -> Iterator[tuple[str, str]]:
     for name, text in SHOWN.items():
         for language in ("python", "py"):
             yield from ((name, code) for code in blocks(text, language))
-    for path in sorted(TUTORIALS.glob("*.ipynb")):
+    for path in NOTEBOOKS:
         cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
         yield from (
             (path.name, "".join(cell["source"])) for cell in cells if cell["cell_type"] == "code"
@@ -166,9 +167,7 @@ def test_options_named_in_the_text_exist() -> None:
     commands += [["reproduce", paper] for paper in ("kameda", "shimada", "date")]
     shown = [run_command([*one, "--help"], env=ENVIRONMENT) for one in commands]
     known = {word for one in shown for word in re.findall(r"--[a-z][a-z-]*", one.output)}
-    # CHANGELOG names options that left, too.
-    texts = [text for name, text in SHOWN.items() if name != "CHANGELOG.md"]
-    named = {word for text in texts for word in re.findall(r"`(--[a-z][a-z-]*)", text)}
+    named = {word for text in SHOWN.values() for word in re.findall(r"`(--[a-z][a-z-]*)", text)}
     assert {"--json", "--resume", "--package"} <= named
     assert named - known - {"--help"} == set()
 
@@ -190,10 +189,10 @@ def anchors(page: Path) -> set[str]:
     return {re.sub(r"[^\w\- ]", "", one.lower()).replace(" ", "-") for one in headings}
 
 
-@each_page
+@pytest.mark.parametrize("page", [*TEXTS, *(f"tutorials/{one.name}" for one in NOTEBOOKS)])
 def test_links_lead_somewhere(page: str) -> None:
-    targets = re.findall(r"\]\(([^)\s]+)\)", TEXTS[page])
-    targets += re.findall(r'src="([^"]+)"', TEXTS[page])
+    text = (ROOT / page).read_text(encoding="utf-8")
+    targets = re.findall(r"\]\(([^)\s]+)\)", text) + re.findall(r'src="([^"]+)"', text)
     for target in targets:
         if target.startswith("https://"):
             continue

@@ -22,7 +22,7 @@ from drake_pose.body.model import (
     require_registered,
     reshaped,
 )
-from drake_pose.body.model_files import bundled_model, package_folder
+from drake_pose.body.model_files import bundled_model, package_folder, xml_element
 from drake_pose.body.node_skin import ModelSkin
 from drake_pose.body.parsed_model import ParsedModel, link_names, nearest_turn
 from drake_pose.body.parsing import ModelSource, captured_warnings

@@ -106,7 +106,7 @@ def landmarks_of_nodes(tree: PoseTree, landmarks: Mapping[str, Landmark]) -> Nod
     with no node, because it has no geometry.
     """
     model = tree.model
-    graph = build_link_graph(model, tree.root if tree.root in model.link_meshes else None)
+    graph = build_link_graph(model, None)
     node_of_group = {graph.group_of(node.name): index for index, node in enumerate(tree.nodes)}
     kinematics = PlantKinematics(model)
     nodes, points = [], []

@@ -29,7 +29,7 @@ from pydrake.multibody.tree import (
 from drake_pose.arrays import Array
 from drake_pose.body.link_graph import PlantKinematics
 from drake_pose.body.meshes import TriangleMesh, join_meshes, labelled_meshes, make_drawable
-from drake_pose.body.model_files import number_text, xml_text
+from drake_pose.body.model_files import number_text, xml_element, xml_text
 from drake_pose.body.parsed_model import (
     ParsedModel,
     SkinBand,
@@ -57,9 +57,6 @@ BASE_JOINTS = ("free_x", "free_y", "free_z", "free_turn_z", "free_turn_y", "free
 
 Vectors = Mapping[str, Sequence[float]]
 """Vectors (3,) by the name of a link or joint."""
-
-# Keep the prefix of Drake's own elements, which Drake requires.
-ElementTree.register_namespace("drake", "http://drake.mit.edu")
 
 
 def require_registered(plant: MultibodyPlant, scene_graph: SceneGraph) -> str:
@@ -228,7 +225,7 @@ class ArticulatedModel(ParsedModel):
         from scipy.spatial.transform import Rotation  # Slow to import.
 
         rpy = Rotation.from_matrix(X_WB[:3, :3]).as_euler("xyz")
-        root = ElementTree.fromstring(self._urdf().text)
+        root = xml_element(self._urdf().text)
         for element in root.iter():
             for key in ("name", "link"):
                 if element.tag in ("link", "parent", "child") and element.get(key) == "world":
@@ -477,7 +474,7 @@ def reshaped(
             about its axis or shifted along it, and its limits are moved so that they stay in place.
             None: none.
     """
-    root = ElementTree.fromstring(text)
+    root = xml_element(text)
     for link in root.iterfind("link"):
         name = link.get("name", "")
         for visual in link.findall("visual"):

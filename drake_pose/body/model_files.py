@@ -44,22 +44,30 @@ def read_xml(path: Path) -> ElementTree.Element:
     text = _uncommented(text.lstrip())
     if "<!ENTITY" not in text:
         text = re.sub(r"&(?!(?:#\d+|#x[0-9a-fA-F]+|lt|gt|amp|quot|apos);)", "&amp;", text)
-    builder = ElementTree.TreeBuilder()
     try:
-        # Without a namespace separator, a prefix stays part of the name.
-        parser = expat.ParserCreate("utf-8")
-        parser.buffer_text = True
-        parser.StartElementHandler = builder.start
-        parser.EndElementHandler = builder.end
-        parser.CharacterDataHandler = builder.data
-        # Zero makes an external entity an error; expat's default ignores it silently.
-        parser.ExternalEntityRefHandler = lambda *_: 0
-        parser.Parse(text.encode("utf-8"), True)
+        return xml_element(text)
     except expat.ExpatError as error:
         place = f"line {error.lineno + blank_lines}, column {error.offset}"
         raise ModelError(
             f"{path} is not well-formed XML: {expat.ErrorString(error.code)}: {place}"
         ) from error
+
+
+def xml_element(text: str) -> ElementTree.Element:
+    """Return the root element of an XML text, without comments; prefixes are parts of names.
+
+    Raises ExpatError: the text is not well-formed, or has an external entity.
+    """
+    builder = ElementTree.TreeBuilder()
+    # Without a namespace separator, a prefix stays part of the name.
+    parser = expat.ParserCreate("utf-8")
+    parser.buffer_text = True
+    parser.StartElementHandler = builder.start
+    parser.EndElementHandler = builder.end
+    parser.CharacterDataHandler = builder.data
+    # Zero makes an external entity an error; expat's default ignores it silently.
+    parser.ExternalEntityRefHandler = lambda *_: 0
+    parser.Parse(text.encode("utf-8"), True)
     return builder.close()
 
 
@@ -77,7 +85,7 @@ def _uncommented(text: str) -> str:
 
 
 def xml_text(root: ElementTree.Element) -> str:
-    """Return the text of an element tree from ``read_xml``."""
+    """Return the text of an element tree from ``read_xml`` or ``xml_element``."""
     return ElementTree.tostring(root, encoding="unicode")
 
 

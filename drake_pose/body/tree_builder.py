@@ -335,10 +335,9 @@ def _plant_rooted(
             X_WB[:3, 3] = position - PlantKinematics(model).pose(body)[:3, 3]
     X_WA = X_WB @ PlantKinematics(model).pose(graph.groups[0].body)
     roots: Roots = dict.fromkeys(tops, (X_WA, None))
-    name = graph.groups[0].name
     base = BasePose("constant", X_WB)
     assumed = tuple(slide for slide in free if slide not in solved)
-    return _assemble(model, graph, branches, roots, base, held | solved, name, assumed)
+    return _assemble(model, graph, branches, roots, base, held | solved, "world", assumed)
 
 
 def _solve_translations(model: ParsedModel, top: Branch, p_WN: Array) -> dict[int, float]:

@@ -19,6 +19,7 @@ from drake_pose.body import (
     RootRotation,
     load_model,
     reshaped,
+    xml_element,
 )
 from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.episode import JointLog
@@ -321,7 +322,7 @@ def corrected_urdf(
     if folder is None or not model.changes_shape or not (offsets or shifts):
         return None
     text = path.read_text(encoding="utf-8")
-    root = ElementTree.fromstring(reshaped(text, joint_offsets=offsets, joint_shifts=shifts))
+    root = xml_element(reshaped(text, joint_offsets=offsets, joint_shifts=shifts))
     for mesh in root.iter("mesh"):
         name = mesh.get("filename", "")
         if "://" not in name:

@@ -156,9 +156,9 @@ class _Capture:
         return FrameViews(cameras, [see_silhouette(one, edge_spacing(c)) for c, one in pairs])
 
     def measure_shape(
-        self, frames: Sequence[int], fitted: int = 10
+        self, frames: Sequence[int]
     ) -> tuple[PersonShape | None, dict[int, PersonBelief]]:
-        """Fit the shape to `fitted` of the first frames, and give it to the tracker.
+        """Fit the shape to ten of the first frames, and give it to the tracker.
 
         Returns the shape, and the tracker states in the fitted frames by frame; None and {} where
         the model has no shape joints.
@@ -171,7 +171,7 @@ class _Capture:
                 camera.name: (np.packbits(view.region, axis=1), view.edge)
                 for camera, view in self._see(frame).pairs
             }
-        chosen = spread_over(frames, fitted)
+        chosen = spread_over(frames, 10)
         if self._is_sequence:
             rough = self.follow_all(frames, {})
             poses = {k: one.values for k in chosen if (one := rough[k])}
@@ -272,21 +272,21 @@ class _Capture:
         fit = search.improve_limbs(search.refine(known.values, seen), seen)
         return replace(self.tracker.start(fit.values), inlier_ratio=fit.inlier_ratio)
 
-    def _best_start(self, frames: Sequence[int], tried: int = 3) -> tuple[int, PersonBelief]:
-        """Return the index and the belief of the first of a few frames without alternatives.
+    def _best_start(self, frames: Sequence[int]) -> tuple[int, PersonBelief]:
+        """Return the index and the belief of the first of three frames without alternatives.
 
         If all have some, it is the frame that is explained best. The tracker gets the shape that
-        fits it. Raises SettingsError: two cameras see a person in none of `tried` frames.
+        fits it. Raises SettingsError: two cameras see a person in none of the frames tried.
         """
         found = {}
-        for frame in spread_over(frames, tried):
+        for frame in spread_over(frames, 3):
             if explained := self.find_explanations(frame):
                 found[frame] = explained[0]
                 if not self.alternatives[frame]:
                     break
         if not found:
             raise SettingsError(
-                f"two cameras see no person in any of {tried} frames: give masks that show one"
+                "two cameras see no person in any of the frames tried: give masks that show one"
             )
         clear = [k for k in found if not self.alternatives[k]]
         best = clear[0] if clear else max(found, key=lambda k: found[k][0].closeness)
@@ -320,20 +320,17 @@ def capture_checked(
     count: int,
     is_sequence: bool,
     on_frame: Callable[[int], None] | None,
-    hull_frames: int = 3,
-    min_cameras: int = 3,
 ) -> CheckedCapture:
     """Capture a recording as `capture_person` does, and find its faults.
 
     A camera at fault is left out from its first faulty frame on, unless another may be at fault
-    instead, and the recording is captured again. Identified faults of the rig are undone.
+    instead or fewer than three others remain, and the recording is captured again. Faults of the
+    rig, which the visual hulls of three frames show, are undone if they are identified.
 
     Args:
         tree, cameras, read, is_sequence: as of `capture_person`.
         count: number of frames, all of which are read.
         on_frame: called after each frame with the person, in the first capture only.
-        hull_frames: number of frames whose visual hull is compared with the silhouettes.
-        min_cameras: a camera is left out only if at least this number of others remains.
 
     Raises:
         CameraError: the person is smaller or taller than people are.
@@ -342,9 +339,7 @@ def capture_checked(
         SettingsError: two cameras see a person in no frame.
     """
     recording = require_person(PersonRecording(cameras, read, count, is_sequence), count)
-    rig = find_rig_fault(
-        cameras, [recording.read(k) for k in spread_over(recording.seen, hull_frames)]
-    )
+    rig = find_rig_fault(cameras, [recording.read(k) for k in spread_over(recording.seen, 3)])
     if rig is not None and rig.is_identified:
         undo = rig.undo
         undone = PersonRecording(cameras, lambda k: undo(read(k)), count, is_sequence)
@@ -362,7 +357,7 @@ def capture_checked(
         if fault is None:
             break
         others = len(recording.cameras_at(fault.first)) - 1
-        fault = replace(fault, is_left_out=others >= min_cameras and not fault.alternatives)
+        fault = replace(fault, is_left_out=others >= 3 and not fault.alternatives)
         found.append(fault)
         if not fault.is_left_out:
             break
@@ -393,12 +388,12 @@ class _CaptureComparison(CameraComparison):
         flatten = self._fit.kinematics.flatten
         self._values = {k: flatten(tree.values_from_positions(captured.q[k])) for k in found}
 
-    def find(self, compared: int = 10) -> CameraFault | None:
+    def find(self) -> CameraFault | None:
         """Return the camera that disagrees most with the others, and since when; None: none does.
 
-        Cameras are compared in `compared` frames: in all of them, and in the last third.
+        Cameras are compared in ten frames: in all of them, and in the last third.
         """
-        picked = spread_over(list(self._values), compared)
+        picked = spread_over(list(self._values), 10)
         views = []
         for frame in picked:
             masks = self._recording.read(frame).items()

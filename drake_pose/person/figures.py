@@ -103,12 +103,11 @@ def _coarse(mask: Mask) -> tuple[Picture, int]:
 
 
 def find_persons(
-    cameras: Sequence[Camera], figures: Sequence[Sequence[Figure]], examined: int = 8
+    cameras: Sequence[Camera], figures: Sequence[Sequence[Figure]]
 ) -> tuple[Person, ...]:
     """Return the persons that two or more cameras see, the best supported first; () if none.
 
-    ``figures``: of each camera's mask, in the order of `cameras`. ``examined``: number of best
-    supported positions that are examined for each further person.
+    ``figures``: of each camera's mask, in the order of `cameras`.
     """
     if all(len(own) <= 1 for own in figures):
         taken = {k: 0 for k, own in enumerate(figures) if own}
@@ -128,8 +127,8 @@ def find_persons(
         positions = meeting_points(cameras, middles, 2.0 * _MAX_RAY_DISTANCE, is_candidate)
         best: tuple[float, float, Person] | None = None
         scores, nearest = _support(cameras, figures, free, positions)
-        # Places with the same nearest figures belong to one person.
-        for chosen in dict.fromkeys(map(tuple, nearest[np.argsort(-scores)[:examined]].tolist())):
+        # The best few are examined. Places with the same nearest figures belong to one person.
+        for chosen in dict.fromkeys(map(tuple, nearest[np.argsort(-scores)[:8]].tolist())):
             taken = {k: i for k, i in enumerate(chosen) if i >= 0}
             if len(taken) < 2:
                 continue
@@ -165,15 +164,14 @@ def _support(
     positions: Array,
     *,
     covers: float = 0.4,
-    misses: float = -1.0,
 ) -> tuple[Array, Indices]:
     """Score positions (n, 3) by the figures that support a person there.
 
     A free figure adds 0.5 to 1 if its ray passes within 0.35 m.
 
     ``figures``: of each camera's mask. ``free``: indices of the figures of each camera that belong
-    to no person yet. ``covers``: score of a figure whose box only covers the position. ``misses``:
-    score of a camera that sees the position, but no figure there.
+    to no person yet. ``covers``: score of a figure whose box only covers the position. A camera
+    that sees the position, but no figure there, subtracts 1.
 
     Returns (n,) sums of the scores over the cameras whose picture contains the position; (n,
     cameras) index of the nearest free figure, -1 where no ray passes within 0.35 m.
@@ -186,7 +184,7 @@ def _support(
             is_visible = (depth > 0.0) & (uv >= 0.0).all(axis=1)
             is_visible &= (uv < [camera.width, camera.height]).all(axis=1)
         if not own:
-            scores += misses * is_visible
+            scores -= is_visible
             continue
         distances = np.array([ray_distances(camera, figure.middle, positions) for figure in own])
         distances[[i for i in range(len(own)) if i not in free[k]]] = np.inf
@@ -198,7 +196,7 @@ def _support(
         covered = np.any(np.all(within, axis=2), axis=1)
         fits = is_visible & (distance < _MAX_RAY_DISTANCE)
         taken[:, k] = np.where(fits, nearest, -1)
-        points = np.where(covered, covers, misses)
+        points = np.where(covered, covers, -1.0)
         points[fits] = 1.0 - 0.5 * distance[fits] / _MAX_RAY_DISTANCE
         scores += points * is_visible
     return scores, taken

@@ -43,6 +43,32 @@ def write(folder: Path, text: str, name: str = "thing.urdf") -> Path:
     return path
 
 
+def random_urdf(rng: np.random.Generator, count: int = 9) -> str:
+    """Links on random joints, some without geometry, some joints following others."""
+    parts = [
+        link(f"l{i}", ("", BOX, SPHERE)[rng.integers(3)] if i % 4 else BOX) for i in range(count)
+    ]
+    leaders = rng.permutation(count)
+    for i in range(count):
+        parent = "world" if i == 0 else f"l{rng.integers(i)}"
+        kind = ("revolute", "revolute", "prismatic", "continuous", "fixed")[rng.integers(5)]
+        if i == 0 and rng.random() < 0.3:
+            continue  # A floating base.
+        # Joints follow such as come later in a random order: no two are coupled twice.
+        leader = rng.integers(1, count)
+        more = ""
+        if rng.random() < 0.4 and leaders[leader] > leaders[i] and kind != "fixed":
+            factor, offset = rng.choice([-1.0, -0.5, 0.5, 1.0]), rng.uniform(-0.1, 0.1)
+            more = f'<mimic joint="j{leader}" multiplier="{factor}" offset="{offset}"/>'
+        x, y, z, *turn = rng.uniform(-0.5, 0.5, 6)
+        where = f'xyz="{x} {y} {z}" rpy="{turn[0]} {turn[1]} {turn[2]}"'
+        axis, limits = f"{turn[1]} {turn[2]} 1", 'lower="-1" upper="1"'
+        parts.append(
+            joint(f"j{i}", kind, parent, f"l{i}", axis=axis, limits=limits, origin=where, more=more)
+        )
+    return urdf(*parts)
+
+
 # A floating trunk; an arm of two joints through a link without geometry, then a prismatic hand.
 FLOATING_URDF = urdf(
     *(link("trunk"), link("between", ""), link("arm"), link("hand"), link("welded", SPHERE)),
@@ -76,6 +102,22 @@ WELDED_URDF = urdf(
     joint("a1", "revolute", "base", "upper", axis="0 0 1"),
     joint("a2", "revolute", "upper", "lower", axis="0 1 0"),
 )
+
+
+# A driven finger, a finger that follows it, its tip, which follows by half, and a nail on the tip;
+# last a follower that cannot be enforced, because other joints move it, too.
+HAND_LINKS = (link("world", ""), *map(link, ("palm", "one", "two", "tip", "nail", "far")))
+HAND_JOINTS = (
+    joint("wrist", "revolute", "world", "palm", axis="0 1 0"),
+    joint("lead", "revolute", "palm", "one", axis="1 0 0", limits='lower="0" upper="0.8"'),
+    joint("mirror", "revolute", "palm", "two", axis="1 1 0", limits='lower="-0.6" upper="0.1"',
+          more='<mimic joint="lead" multiplier="-1" offset="0.1"/>'),
+    joint("bend", "revolute", "two", "tip", axis="0 1 0",
+          more='<mimic joint="mirror" multiplier="0.5" offset="-0.05"/>'),
+    joint("scratch", "revolute", "tip", "nail", axis="0 0 1"),
+    joint("far", "prismatic", "nail", "far", axis="0 0 1", more='<mimic joint="lead"/>'),
+)  # fmt: skip
+HAND = urdf(*HAND_LINKS, *HAND_JOINTS)
 
 
 def _sdf_link(name: str) -> str:

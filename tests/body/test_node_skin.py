@@ -16,25 +16,13 @@ def in_frame(X, points):
     return points @ X[:3, :3].T + X[:3, 3]
 
 
-def test_band_at_rest_equals_its_mesh(tmp_path):
-    model = load_limb(tmp_path)
-    ends = [(band.parent, band.child) for band in model.skin]
-    assert ends == [("upper", "lower"), ("lower", "hand")]
-    first, *others = model.pose_tree().nodes
-    assert first.skin is None
-    lines = [line.split() for line in tube_obj().splitlines()]
-    drawn = np.array([line[1:] for line in lines if line[0] == "v"], dtype=float)
-    fraction = np.interp(-drawn[:, 2], [-REACH, 0.0, REACH], [0.0, 0.5, 1.0])
-    known = np.isin(fraction, [0.0, 0.5, 1.0])
-    for node in others:
-        found = node.skin.vertices(np.zeros((1, len(node.value_names))))[0]
-        np.testing.assert_allclose(found, drawn)
-        np.testing.assert_allclose(node.skin.mesh.vertices, drawn)
-        np.testing.assert_allclose(node.skin.weights[known], fraction[known], atol=1e-12)
-
-
 def test_vertex_rotates_by_its_weight_times_the_angle(tmp_path):
-    node = load_limb(tmp_path).pose_tree().nodes[1]
+    root, node, hand = load_limb(tmp_path).pose_tree().nodes
+    assert root.skin is None
+    # The weight is the smoothstep of the way along the limb.
+    for skin in (node.skin, hand.skin):
+        at = (REACH - skin.mesh.vertices[:, 2]) / (2.0 * REACH)
+        np.testing.assert_allclose(skin.weights, at * at * (3.0 - 2.0 * at), atol=1e-6)
     angles = np.array([-2.1, -0.4, 0.0, 1.0, 2.4])
     found = node.skin.vertices(angles[:, None])
     for angle, p_N in zip(angles, found, strict=True):
@@ -45,7 +33,7 @@ def test_vertex_rotates_by_its_weight_times_the_angle(tmp_path):
         np.testing.assert_allclose(p_N, expected, atol=1e-14)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_ends_of_a_band_move_rigidly_with_their_links(tmp_path, seed):
     """Drake's poses of both links move the band's ends; other joints do not move the band."""
     model = load_limb(tmp_path)
@@ -65,6 +53,9 @@ def test_ends_of_a_band_move_rigidly_with_their_links(tmp_path, seed):
         for at in (q, mixed)
     ]
     np.testing.assert_allclose(in_hand[0], in_hand[1], atol=1e-12)
+    for mesh, p_W0, band in zip(skin.meshes, skin.vertices(rest), skin.bands, strict=True):
+        X = link_poses(model, rest)[band.child]
+        np.testing.assert_allclose(p_W0, in_frame(X, mesh.vertices), atol=1e-14)
 
 
 @pytest.mark.parametrize("root", ["lower", "hand"])
@@ -108,7 +99,13 @@ def test_band_of_a_welded_link_belongs_to_its_group(tmp_path):
     np.testing.assert_allclose(p_W, in_frame(link_poses(model, q)["lower"], in_node), atol=1e-12)
 
 
-def test_invalid_band_is_refused(tmp_path):
+def test_invalid_bands_and_skin_files_are_refused(tmp_path):
+    tube, entry = tube_obj(), band_entry("upper", "lower")
+    (tmp_path / "open.obj").write_text(tube[: tube.rindex("f ")])
+    texts = [("bands:\n" + entry + entry, "two bands between")]
+    texts += [
+        (one, "limb.skin") for one in ("- 1", "bands: 3", "bands: [1", "bands: []", "other: 1")
+    ]
     for changes, message in (
         ({"mesh": "none.obj"}, "none.obj does not exist"),
         ({"mesh": None}, "name its mesh"),
@@ -121,35 +118,22 @@ def test_invalid_band_is_refused(tmp_path):
         ({"begin": "x"}, "parent, child, mesh, axis, begin"),
         ({"mesh": "open.obj"}, "not closed"),
     ):
-        text = tube_obj()
-        (tmp_path / "open.obj").write_text(text[: text.rindex("f ")])
-        entry = band_entry(**({"parent": "upper", "child": "lower"} | changes))
-        with pytest.raises(ModelError, match=message) as caught:
-            load_limb(tmp_path, "bands:\n" + entry)
-        assert "limb.skin.yaml" in str(caught.value) or "none.obj" in str(caught.value)
-
-
-def test_invalid_skin_files_are_refused(tmp_path):
-    invalid = ["- 1", "3", "bands: 3", "bands: [1", "bands: []", "bands: {a: 1}", "other: 1", "\0"]
-    for text in (*invalid, "bands:"):
-        with pytest.raises(ModelError, match=r"limb\.skin\.yaml"):
+        changed = band_entry(**({"parent": "upper", "child": "lower"} | changes))
+        texts.append(("bands:\n" + changed, message))
+    for text, message in texts:
+        with pytest.raises(ModelError, match=message):
             load_limb(tmp_path, text)
     path = limbs.write_limb(tmp_path, "bands:\n" + band_entry("upper", "paw"))
     for check in (False, True):
         with pytest.raises((UnknownNameError, ModelError), match=r"skin\.yaml has no link 'paw'"):
             load_model(path, check=check)
-    entry = band_entry("upper", "lower")
-    with pytest.raises(ModelError, match="two bands between"):
-        load_limb(tmp_path, f"bands:\n{entry}{entry}")
 
 
 def test_band_must_join_neighbours(tmp_path):
     for parent, child, use, message in (
         ("upper", "hand", ArticulatedModel.pose_tree, "not neighbours"),
         ("world", "lower", ArticulatedModel.pose_tree, "not neighbours"),
-        # On conversion for Drake.
-        ("lower", "upper", ModelSkin, "exchanged"),
+        ("lower", "upper", ModelSkin, "exchanged"),  # On conversion for Drake.
     ):
-        model = load_limb(tmp_path, "bands:\n" + band_entry(parent, child))
         with pytest.raises(DrakePoseError, match=message):
-            use(model)
+            use(load_limb(tmp_path, "bands:\n" + band_entry(parent, child)))

@@ -5,14 +5,19 @@ import pytest
 
 from drake_pose.body import RootRotation, load_model
 from drake_pose.body.link_graph import JointMap
-from drake_pose.body.tree_kinematics import TreeKinematics
+from drake_pose.body.tree_kinematics import TreeKinematics, link_vectors
 from drake_pose.errors import ModelError, SettingsError
-from tests.body.models import FLOATING_URDF, JOINTED_BASE_URDF, JOINTS_SDF, WELDED_URDF, write
+from drake_pose.fit.parameters import BodyParameters
+from drake_pose.fit.surfaces import VERY_FEW, simplify_surfaces
+from drake_pose.silhouette.outline import TreeSurfaces
+from tests.body.models import FLOATING_URDF, HAND, JOINTED_BASE_URDF, JOINTS_SDF, WELDED_URDF, write
+from tests.fit.motions import assert_motions_are_derivatives
 
 _TURNED = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
 _LIMITED = RootRotation.limited([("y", -90, 90), ("z", -20, 30)], rotation=_TURNED)
 _LEG = {"root": "leg", "root_position": (0.0, 0.2, 0.0), "root_rotation": _LIMITED}
 _TREES = {
+    "free": (FLOATING_URDF, "f.urdf", {"root_rotation": RootRotation.free()}),
     "floating": (FLOATING_URDF, "f.urdf", {"root_position": (0.3, -0.2, 0.9)}),
     "re-rooted": (FLOATING_URDF, "f.urdf", {"root": "hand", "root_position": (0.3, 0.2, 0.1)}),
     "re-rooted, limited": (FLOATING_URDF, "f.urdf", _LEG),
@@ -34,7 +39,10 @@ def kinematics(request, tmp_path_factory):
 
 def draw(kinematics, seed):
     lower, upper = (np.clip(b, -5.0, 5.0) for b in (kinematics.lower, kinematics.upper))
-    return np.random.default_rng(seed).uniform(lower, upper)
+    values = np.random.default_rng(seed).uniform(lower, upper)
+    # Near no rotation at all, too.
+    values[:3] *= (1e-6, 1e-3, 1.0)[seed % 3] if kinematics.tree.turns_root_freely else 1.0
+    return values
 
 
 def move(motions, j, points):
@@ -69,19 +77,16 @@ def test_motions_match_finite_differences_of_poses(kinematics):
             assert np.abs(move(motions, j, place(values)) - difference).max() < 1e-7
 
 
-def test_derivative_of_a_free_root_is_right_near_the_identity(tmp_path):
-    model = load_model(write(tmp_path, FLOATING_URDF), check=False)
-    kinematics = TreeKinematics(model.pose_tree(root_rotation=RootRotation.free()))
-    for size in (0.0, 1e-6, 1e-4, 1e-3):
-        values = np.zeros(len(kinematics.names))
-        values[:3] = size * np.array([0.4, -0.7, 0.5])
-        motions = kinematics.motions(values)
-        for j in range(3):
-            step = 1e-5 * np.eye(len(values))[j]
-            turned = kinematics.poses(values + step) - kinematics.poses(values - step)
-            W = (turned[0] / 2e-5)[:3, :3] @ motions.X_WN[0, :3, :3].T
-            found = np.array([W[2, 1], W[0, 2], W[1, 0]])
-            assert np.abs(found - motions.twists[j, :3]).max() < 1e-8
+def test_motions_of_a_body_against_finite_differences(tmp_path):
+    """Of joints that follow others, too, and with link scales."""
+    tree = load_model(write(tmp_path, HAND), check=False).pose_tree()
+    kinematics = TreeKinematics(tree)
+    low, high = np.maximum(kinematics.lower, -1.0), np.minimum(kinematics.upper, 1.0)
+    values = np.random.default_rng(1).uniform(low, high)
+    surfaces = simplify_surfaces(TreeSurfaces(tree), VERY_FEW)
+    body = BodyParameters(kinematics, surfaces, offsets=link_vectors(tree))
+    for logs in ([], [0.0] * 4 + np.linspace(0.1, 0.2, len(body.links)).tolist()):
+        assert_motions_are_derivatives(body, np.append(values, logs))
 
 
 def test_translation_and_scale_move_the_first_roots_tree(kinematics):
@@ -109,10 +114,7 @@ def test_wrong_numbers_of_values_are_refused(kinematics):
 
 
 def test_unsupported_joint_motion_is_refused():
-    def pose(values):
-        X = np.eye(4)
-        X[0, 3] = 1e-3 * values[0] ** 2
-        return X
-
     with pytest.raises(ModelError, match="joint 'odd' moves in a way"):
-        JointMap.measure(pose, 1, "odd")
+        JointMap.measure(
+            lambda q: np.eye(4) + 1e-3 * q[0] ** 2 * np.eye(4)[:, [3, 0, 1, 2]], 1, "odd"
+        )

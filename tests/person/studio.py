@@ -6,13 +6,7 @@ import numpy as np
 
 from drake_pose.body import bundled_model, load_model
 from drake_pose.camera.models import FACE_CAMERA, circle_of_cameras
-from drake_pose.person.date.features import (
-    cut_face,
-    find_features,
-    learn_faces,
-    register_pose,
-    see_person,
-)
+from drake_pose.person.date import features
 from drake_pose.person.date.skeleton import load_skeleton, registered_positions
 from drake_pose.silhouette.segmentation import learn_background
 from drake_pose.systems.cameras import build_camera_rig
@@ -44,7 +38,7 @@ class Studio:
         return self.rig.mask(self.context, name)
 
     def view(self, q, name):
-        return see_person(self.picture(q, name), self.mask(q, name))
+        return features.see_person(self.picture(q, name), self.mask(q, name))
 
     def views(self, q):
         return {name: self.view(q, name) for name in self.ring}
@@ -63,7 +57,7 @@ class Studio:
         q = registered_positions(self.skeleton)
         q[2] = HEAD_HEIGHT
         cameras = list(self.ring.values())
-        return register_pose(
+        return features.register_pose(
             self.skeleton, q, cameras, lambda camera, q: self.mask(q, camera.name), 36
         )
 
@@ -71,7 +65,7 @@ class Studio:
     def calibrated(self):
         """The skeleton whose features are where the cameras see them."""
         views = self.views(self.registered.q)
-        found = find_features(
+        found = features.find_features(
             list(self.ring.values()),
             list(views.values()),
             self.skeleton.features(self.registered.q),
@@ -88,5 +82,5 @@ class Studio:
             q = self.posed()
             q[self.skeleton.head_angles] = direction
             picture, view = self.face(q)
-            faces.append(cut_face(picture, view.blobs))
-        return learn_faces(faces, directions)
+            faces.append(features.cut_face(picture, view.blobs))
+        return features.learn_faces(faces, directions)

@@ -4,7 +4,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import cv2
 import numpy as np
 import trimesh
 
@@ -32,22 +31,18 @@ def committed(name: str) -> list[Path]:
 
 def read_obj(path: Path) -> trimesh.Trimesh:
     """Read a surface without merging vertices; check that normals point outwards."""
-    vertices, normals, triangles = [], [], []
-    for line in path.read_text().splitlines():
-        kind, *rest = line.split()
-        if kind == "v":
-            vertices.append([float(value) for value in rest])
-        elif kind == "vn":
-            normals.append([float(value) for value in rest])
-        elif kind == "f":
-            corners = [corner.split("//") for corner in rest]
-            assert all(vertex == normal for vertex, normal in corners)
-            triangles.append([int(vertex) - 1 for vertex, _ in corners])
-    mesh = trimesh.Trimesh(np.array(vertices), np.array(triangles), process=False)
-    unit = np.array(normals)
-    np.testing.assert_allclose(np.linalg.norm(unit, axis=1), 1.0, atol=2e-3)
-    corner_normals = unit[mesh.faces].mean(axis=1)
-    assert np.mean(np.einsum("ij,ij->i", corner_normals, mesh.face_normals) > 0.0) > 0.99
+    rows = [line.split() for line in path.read_text().splitlines()]
+    vertices, normals = (
+        np.array([row[1:] for row in rows if row[0] == kind], dtype=np.float64)
+        for kind in ("v", "vn")
+    )
+    corners = [[corner.split("//") for corner in row[1:]] for row in rows if row[0] == "f"]
+    faces = np.array(corners, dtype=np.int64) - 1
+    np.testing.assert_array_equal(faces[..., 0], faces[..., 1])
+    mesh = trimesh.Trimesh(vertices, faces[..., 0], process=False)
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=2e-3)
+    along = np.einsum("ij,ij->i", normals[mesh.faces].mean(axis=1), mesh.face_normals)
+    assert np.mean(along > 0.0) > 0.99
     return mesh
 
 
@@ -61,23 +56,17 @@ def assert_closed(mesh: trimesh.Trimesh) -> None:
 
 
 class Silhouettes:
-    """Renders masks of a model by a parallel camera from any side."""
+    """Draws masks of a model by a parallel camera from any side."""
 
     def __init__(self, model: ArticulatedModel):
         self.tree = model.pose_tree()
         self.outlines = [outline_from_mesh(node.mesh) for node in self.tree.nodes]
 
     def mask(
-        self, q: np.ndarray, towards: np.ndarray, target: np.ndarray, size: float, pixels: int = 400
+        self, q: np.ndarray, towards: np.ndarray, target: np.ndarray, size: float
     ) -> np.ndarray:
-        """Return a mask (pixels, pixels) seen from a direction (3,), `size` [m] wide."""
+        """Return a mask (400, 400) seen from a direction (3,), `size` [m] wide."""
         X_WC = look_at(target + 10.0 * np.asarray(towards) / np.linalg.norm(towards), target)
-        middle = 0.5 * (pixels - 1)
-        camera = ParallelCamera("side", pixels, pixels, pixels / size, middle, middle, X_WC)
+        camera = ParallelCamera("side", 400, 400, 400.0 / size, 199.5, 199.5, X_WC)
         X_WN = self.tree.node_poses(self.tree.values_from_positions(q))
         return draw_mask(self.outlines, camera.X_CW @ X_WN, camera)
-
-
-def pieces(mask: np.ndarray) -> int:
-    """Return the number of connected components of a mask."""
-    return cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)[0] - 1

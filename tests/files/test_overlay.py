@@ -1,4 +1,4 @@
-"""Overlays, pixel by pixel, against their definition, OpenCV's text and Drake's renderer."""
+"""Overlays, pixel by pixel, against their definition and OpenCV's text."""
 
 import cv2
 import numpy as np

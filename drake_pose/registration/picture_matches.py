@@ -117,10 +117,10 @@ def _tracks(edges: Indices, picture: Indices, uv: Array) -> Sightings:
     _, label = connected_components(graph, directed=False)
     size = np.bincount(label)
     used = np.flatnonzero(size[label] > 1)
-    key = label[used] * (picture.max() + 1) + picture[used]
-    _, inverse, times = np.unique(key, return_inverse=True, return_counts=True)
+    pairs = np.column_stack([label[used], picture[used]])
+    _, inverse, times = np.unique(pairs, axis=0, return_inverse=True, return_counts=True)
     # A track with two features in a picture is dropped: which feature is right is not known.
-    ambiguous = np.unique(label[used][times[inverse] > 1])
+    ambiguous = np.unique(label[used][times[inverse.ravel()] > 1])
     used = used[~np.isin(label[used], ambiguous)]
     _, points = np.unique(label[used], return_inverse=True)
     return Sightings(picture[used], points, uv[used])

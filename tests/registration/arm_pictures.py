@@ -66,3 +66,10 @@ def errors(found: np.ndarray, true: np.ndarray) -> tuple[float, float]:
     cosine = 0.5 * (np.trace(found[:3, :3].T @ true[:3, :3]) - 1.0)
     shift = float(np.linalg.norm(found[:3, 3] - true[:3, 3]))
     return shift, float(np.arccos(np.clip(cosine, -1.0, 1.0)))
+
+
+def assert_close(found: np.ndarray, true: np.ndarray, metres: float, degrees: float) -> None:
+    """Assert that a pose (4, 4) errs by less than so many metres and degrees."""
+    shift, turn = errors(found, true)
+    assert shift < metres
+    assert turn < np.radians(degrees)

@@ -112,7 +112,7 @@ def test_points_that_ride_along_do_not_count() -> None:
         np.concatenate([seen.uv, np.tile(fixed, (len(X_WL), 1))]),
     )
     fit = fit_tracks(problem_of(both, lambda _: X_WL), X_LC)
-    assert np.linalg.norm(error(fit.X_LC)[3:]) < 0.001
+    assert np.linalg.norm(error(fit.X_LC)[3:]) < 0.0003
     assert fit.inliers[: len(seen.uv)].mean() > 0.98
     assert fit.inliers[len(seen.uv) :].mean() < 0.2
 
@@ -123,7 +123,7 @@ def test_points_that_ride_along_do_not_count() -> None:
 def test_covariances_are_those_of_many_noisy_scenes(joint_noise, noise, least, most) -> None:
     """The jackknife has eleven degrees of freedom, and contains the noise of the joints."""
     X_WL, rows = hand(TIMES), []
-    for seed in range(24):
+    for seed in range(16):
         rng = np.random.default_rng(seed)
         off = rng.normal(0.0, joint_noise, (len(X_WL), 6)) * [1, 1, 1, 0, 0, 0]
         seen = see(X_WL @ motion(off), table_points(rng, 60), noise, rng)

@@ -18,7 +18,8 @@ class TestCameraSearch:
         frames = see(model, body, camera, 5, 1)
         found = CameraSearch(body).register(camera.with_pose(np.eye(4)), frames)
         shift, turn = errors(found.camera.X_WC, camera.X_WC)
-        assert (shift < 2e-3, turn < np.radians(0.1)) == (True, True)
+        assert shift < 2e-3
+        assert turn < np.radians(0.05)
         assert (found.outliers, len(found.alternatives)) == ((), 0)
         own = replace(found, covariance=found.covariance - found.common)
         assert shift < 4.0 * np.sqrt(3.0) * own.translation_sd < 0.01
@@ -33,13 +34,12 @@ class TestCameraSearch:
         found = CameraSearch(body).register(camera, frames)
         shift, turn = errors(found.camera.X_WC, camera.X_WC)
         assert found.outliers == ("0003",)
-        assert shift < 3e-3
-        assert turn < np.radians(0.15)
+        assert shift < 6e-4
+        assert turn < np.radians(0.015)
 
     def test_a_search_without_frames_is_refused(self, body: RegistrationBody) -> None:
-        camera = looking_at(PLACE, MIDDLE, 0.1)
         with pytest.raises(RegistrationError, match="'eye': no frame"):
-            CameraSearch(body).register(camera, [])
+            CameraSearch(body).register(looking_at(PLACE, MIDDLE, 0.1), [])
 
 
 class TestUniformRotations:

@@ -72,7 +72,8 @@ class HandModel:
     rings: Array
     # (2, R, 2, 3) end points of candidates for its far and its near edge, as such fractions.
     rows: Array
-    sizes: Mapping[str, float]  # Lengths and sizes of the palm in the model's file [m].
+    # Sizes of the palm in the model's file, and lengths if they were read from it [m].
+    sizes: Mapping[str, float]
     hidden: tuple[str, ...] = ()  # Names among ``measured`` that silhouettes do not show.
     prior: JointPrior | None = None  # Prior of the joints, over ``angles``; None: there is none.
 
@@ -175,9 +176,7 @@ def _two_fingers() -> HandModel:
         steps.append(tuple(own))
     box = np.array([[[x, y, z] for y in (-0.5, 0.5) for z in (0.5, -0.5)] for x in (0.0, 1.0)])
     rows = box[::-1].reshape(2, 2, 2, 3)
-    drawn = {"1": 0.055, "2": 0.03, "3": 0.025}
-    sizes = {f"length_{i}{j}": length for i in (1, 2) for j, length in drawn.items()}
-    sizes |= {"palm_width": 0.07, "palm_height": 0.08, "palm_thickness": 0.02}
+    sizes = {"palm_width": 0.07, "palm_height": 0.08, "palm_thickness": 0.02}
     return HandModel(("1", "2"), tuple(steps), np.full((2, 4), 0.008), box, rows, sizes)
 
 

@@ -212,8 +212,6 @@ def inner_point(inequalities: Inequalities) -> Array:
         bounds=[(None, None)] * n + [(None, 1.0)],
         method="highs",
     )
-    if solution.x is None:
-        raise SettingsError(f"the inequalities cannot be checked: {solution.message}")
     radius = float(solution.x[-1])
     if radius > 1e-12 * max(1.0, float(np.abs(unit_b).max())):
         return solution.x[:n]

@@ -16,11 +16,11 @@ def right_hand() -> tuple[ArticulatedModel, HandModel]:
 
 
 def hand_at(hand: HandModel, quaternion, angles=0.0) -> np.ndarray:
-    """Return the state of a hand at rest whose sizes are those of its model."""
+    """Return the state of a hand at rest of its model's sizes, lengths of 5 cm if it has none."""
     layout = hand.layout
     x = np.zeros(len(layout))
     x[2:6], x[layout.indices(hand.angles)] = quaternion, angles
-    x[layout.indices(layout.constant)] = [hand.sizes[name] for name in layout.constant]
+    x[layout.indices(layout.constant)] = [hand.sizes.get(name, 0.05) for name in layout.constant]
     return x
 
 

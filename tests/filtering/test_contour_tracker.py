@@ -11,7 +11,14 @@ from drake_pose.errors import SettingsError
 from drake_pose.filtering.contour_observation import ContourObservation
 from drake_pose.filtering.contour_tracker import Tracker, TrackerState, TrackingSettings
 from drake_pose.filtering.state import Belief
-from drake_pose.search import TRACKED, MultiStartSearch, View
+from drake_pose.search import (
+    TRACKED,
+    BeamSearch,
+    BeamSearchSettings,
+    ExaminationSettings,
+    MultiStartSearch,
+    View,
+)
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.filtering.tracks import (
     CAMERA,
@@ -25,7 +32,7 @@ from tests.filtering.tracks import (
     tracker_of,
 )
 from tests.jobs.live_scenes import standing
-from tests.search.bodies import front_camera, near_camera
+from tests.search.bodies import box_link, front_camera, joint, load_body, near_camera
 
 Q = np.array([0.1, 0.4, -0.4])
 SCALED = TrackingSettings(root_moves=True, scale_unknown=True)
@@ -55,9 +62,9 @@ def test_tracked_after_one_match_and_matched_again_after_a_jump(body, renderer):
         state, result = follower.update(state, [View(CAMERA, renderer.mask(q))])
         matched = follower.with_intervals(state, result)
         np.testing.assert_array_equal(matched.q, result.q)
-        for joint, value in zip(matched.pose_set.joints, q, strict=True):
-            held.append(joint.holds(value))
-            widths.append(joint.high - joint.low)
+        for one, value in zip(matched.pose_set.joints, q, strict=True):
+            held.append(one.holds(value))
+            widths.append(one.high - one.low)
         errors.append(np.degrees(np.abs(result.q - q)).max())
         asked.append(state.matches)
     assert asked[0] == asked[11] == 1
@@ -123,6 +130,17 @@ def test_rates_decay_with_memory_and_change_by_their_kinds_acceleration(tree):
     begun = tracker.start(tracker.observation.state(np.zeros(3))).state.hypotheses[0].free
     expected = [*np.array([0.5, 0.6, 0.7])[kinds], *(0.2 * 0.05 * of_kind)]
     np.testing.assert_allclose(begun.deviations(), expected)
+
+
+def test_a_pose_with_a_look_alike_is_as_uncertain_as_both(tmp_path):
+    """A lever looks the same turned towards the camera and away from it."""
+    turn = joint("swing", "revolute", "world", "lever", (-1.0, 1.0), axis="0 1 0")
+    model = load_body(tmp_path, turn, box_link("lever", 8, 30))
+    search = BeamSearch(model.pose_tree(), BeamSearchSettings(interval=0.25), ExaminationSettings())
+    views = [View(CAMERA, LabelRenderer(model, CAMERA).mask(np.array([0.5])))]
+    state, _ = tracker_of(search).update(TrackerState(), views)
+    # Uniform from -0.5 to 0.5, about an end.
+    assert state.spread[0] == pytest.approx(1.0 / np.sqrt(3.0), rel=0.05)
 
 
 def test_a_failed_search_is_reported_and_repeated(body):

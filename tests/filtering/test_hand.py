@@ -88,7 +88,6 @@ def test_mirrored_states_project_alike_and_change_one_angle():
         start = 2 + 2 * (4 * (joint // 3) + joint % 3 + 1)
         end = slice(start, start + 2)
         np.testing.assert_allclose(OBSERVATION.predict(other)[0][end], h[end], atol=1e-9)
-    # Segments that point aside, small changes and those that are not believed are left out.
     assert 0 < len(OBSERVATION.mirrors(belief)) < len(mirrored) == 6
     assert not HandObservation(mirror_slope=0.9, smallest_change=3.0).mirrors(belief)
     assert not HandObservation(mirror_slope=0.9).mirrors(Belief(x, 1e-4 * np.eye(len(x))))

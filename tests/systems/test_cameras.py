@@ -35,8 +35,6 @@ from drake_pose.systems.cameras import (
     SilhouetteCamera,
     build_camera_rig,
     cameras_from_drake,
-    colour_image_to_picture,
-    picture_to_colour_image,
 )
 from tests.benchmarks.silhouette_camera import arm_model, measure_camera
 from tests.person.persons_in_view import posed
@@ -64,15 +62,6 @@ def test_a_rigs_masks_equal_the_label_renderers(person):
     parallel = ParallelCamera("flat", 9, 9, 1.0, 4.0, 4.0, np.eye(4))
     with pytest.raises(CameraError, match="'flat'"):
         build_camera_rig(person, {"flat": parallel})
-
-
-def test_images_without_pixels_are_no_pictures():
-    picture = np.random.default_rng(0).integers(0, 256, (4, 5, 3)).astype(np.uint8)
-    np.testing.assert_array_equal(
-        colour_image_to_picture(picture_to_colour_image(picture)), picture
-    )
-    assert picture_to_colour_image(None).size() == 0
-    assert colour_image_to_picture(picture_to_colour_image(None)).shape == (0, 0, 3)
 
 
 def test_the_mask_player_plays_frame_by_frame(tiny_scene):
@@ -117,7 +106,6 @@ def test_labels_equal_an_rgbd_sensors(name, tmp_path):
     assert len(model.link_meshes) == 15
     assert figures.worst <= 0.002
     assert figures.mean <= 0.0006
-    # The speed is measured in tests/benchmarks; this only checks that no renderer is used.
     assert figures.ours < figures.drakes
 
 

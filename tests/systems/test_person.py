@@ -56,7 +56,6 @@ def test_a_diagram_equals_the_plain_functions(studio):
     path = [studio.posed(left_upper_arm_z=40.0 + 4.0 * k, right_thigh_x=-5.0 * k) for k in range(3)]
     capture = build_silhouette_capture(tracker, cameras, backgrounds, period)
     assert list(capture.stages) == ["region", "edge"]
-    # Deviations take time and are an output only if asked for.
     assert not capture.diagram.HasOutputPort("deviations")
     run, estimator = Bench(capture.diagram), capture.estimator
     own = estimator.GetMyMutableContextFromRoot(run.context)
@@ -208,7 +207,6 @@ def test_deviations_match_the_errors(cameras, tracker, poses, alone):
     found = watch(cameras, tracker, [nobody, *alone[:5], nobody])
     assert np.isnan(found["deviations"][[0, -1]]).all()
     assert found["visible"].any(axis=1).tolist() == [False] + 5 * [True] + [False]
-    # In the first frame with a person, another pose fits nearly as well.
     off = np.abs(found["estimated_positions"][2:-1] - poses[1:5])
     known = found["deviations"][2:-1]
     assert (known > 0.0).all()

@@ -213,7 +213,7 @@ def _read(path: Path, episode_ids: frozenset[str]) -> Content:
 
     ``episode_ids``: of a `.jsonl`, only the lines that hold one of these names are read, if any do.
 
-    Raises CameraError: the file cannot be read, or is damaged.
+    Raises CameraError: the file cannot be read, or is damaged (text that is no YAML: a fault).
     """
     try:
         data = read_regular(path)

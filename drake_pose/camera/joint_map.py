@@ -392,7 +392,7 @@ def match_names(logged: Sequence[str], wanted: Sequence[str]) -> tuple[dict[str,
 
 
 def _is_suffix(a: Sequence[str], b: Sequence[str]) -> bool:
-    """Return whether one of two names a, b, given by `_words`, ends with all words of the other.
+    """Return whether one of two names, as words, ends with all words of the other.
 
     If the shorter name has numbers only, the result is False.
     """

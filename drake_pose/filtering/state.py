@@ -51,7 +51,7 @@ def factor_of(covariance: Array, names: Sequence[str] = (), subject: str = "the 
 def covariance_from(factor: Array) -> Array:
     """Return L L^T (n, n) of L (n, k) = ``factor``, symmetric and if possible positive definite.
 
-    The diagonal is inflated by up to about 1e-9, relative, until a Cholesky factorisation succeeds.
+    The diagonal is inflated by up to 1.1e-10, relative, until a Cholesky factorisation succeeds.
     """
     product = factor @ factor.T
     product = 0.5 * (product + product.T)

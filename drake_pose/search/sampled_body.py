@@ -376,7 +376,7 @@ class SampledBody:
         return np.asarray(np.linalg.norm(np.vstack(roots) - camera.X_WC[:3, 3], axis=1))
 
     def _find_balls(self, node: int, hulls: list[VisualHull]) -> np.ndarray:
-        """Return a node's inscribed balls (k, 4), centres and radii [m] in N, from hulls."""
+        """Return balls (k, 4) in a node: up to ten, and one at each child's joint [m], in N."""
         balls = [hulls[node].spread_balls(10)]
         # A ball far from the parent's joint is most likely outside the silhouette: test it first.
         balls[0] = balls[0][np.argsort(-np.linalg.norm(balls[0][:, :3], axis=1), kind="stable")]

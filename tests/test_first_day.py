@@ -10,7 +10,6 @@ import pytest
 import drake_pose
 from drake_pose import (
     MultiStartSearch,
-    PersonTracker,
     PinholeCamera,
     SilhouetteMatcher,
     TruncatedEkf,
@@ -27,7 +26,6 @@ from drake_pose.errors import CameraError, SettingsError, for_caller, messages_f
 from drake_pose.jobs.batch_tasks import describe_failure
 from drake_pose.jobs.registration.positions import still_joints
 from drake_pose.registration.register import RegistrationBody
-from drake_pose.search import BeamSearch
 
 ROOT = Path(__file__).resolve().parents[1]
 CAMERA = PinholeCamera("c", 64, 48, 60.0, 60.0, 32.0, 24.0, look_at([3, 0, 1], [0, 0, 1]))
@@ -48,12 +46,9 @@ def test_a_model_a_camera_or_a_tuple_where_others_are_expected_is_refused(model,
     start, filtered = (np.zeros(3), np.eye(3)), object.__new__(TruncatedFilter)
     for words, call in (
         (a_model, lambda: MultiStartSearch(model)),
-        (a_model, lambda: BeamSearch(model)),
         (a_model, lambda: RegistrationBody(model)),
         (a_camera, lambda: SilhouetteMatcher(search, CAMERA, 1.0)),
         (a_camera, lambda: save_cameras(tmp_path / "cameras.yaml", CAMERA)),
-        (a_camera, lambda: PersonTracker(None, CAMERA, 1.0)),
-        ("str where cameras", lambda: SilhouetteMatcher(search, "c", 1.0)),
         (r"\[view\]", lambda: search.match(view)),
         ("start must be a Belief.*not a tuple", lambda: TruncatedEkf(filtered, start, 0.1)),
     ):

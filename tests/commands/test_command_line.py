@@ -23,7 +23,6 @@ ROOT = Path(__file__).resolve().parents[2]
     [
         ("commands.main", "numpy numba cv2 pydrake"),
         ("jobs.estimate.scene", "matplotlib trimesh scipy.optimize scipy.stats"),
-        ("jobs.registration.audit", "matplotlib trimesh scipy.optimize scipy.stats"),
         ("jobs.registration.register", "matplotlib trimesh scipy.optimize scipy.stats"),
     ],
 )

@@ -115,20 +115,6 @@ def test_a_changed_job_is_not_resumed(job, out):
             run_batch([job], out, resume=True)
 
 
-def test_an_interrupted_batch_keeps_its_state(job, out):
-    def work(task):
-        if task.index == 1:
-            raise KeyboardInterrupt
-        return finish(task)
-
-    with pytest.raises(KeyboardInterrupt):
-        run_batch([job], out, work=work)
-    told = json.loads((out / "batch.json").read_text())["scenes"]["stills"]
-    assert (told["state"], told["chunks_done"]) == ("waiting", 1)
-    page = require_plain_page((out / "report.html").read_text())
-    assert page.by_id["answer"] == "0 of 1 scenes finished."
-
-
 def test_audits_list_their_errors_and_start_at_the_cameras_of_the_first(tmp_path, out):
     """Also if the first fails; and in a resumed batch, whose first episode is done already."""
     painted, scenes = painted_episode(tmp_path, frames=6), ("one", "two", "three", "gone")

@@ -22,7 +22,6 @@ from drake_pose.jobs.batch_tasks import (
 from drake_pose.jobs.estimate.inputs import bundled_person
 from drake_pose.jobs.estimate.scene import estimate_scene
 from tests.jobs.batches import STILLS, finish, jobs_of, rows
-from tests.jobs.scenes import write_joints
 from tests.registration.episodes import painted_episode
 from tests.registration.recordings import write_episode
 
@@ -244,20 +243,6 @@ def test_audits_have_totals_of_their_summaries(scenes, tmp_path, out, audited):
         (12.0, 3.0), (None, None), (None, None),
     ]  # fmt: skip
     assert cameras["wrist"]["X_WC"] == cameras["left"]["X_WC"] == np.eye(4).tolist()
-
-
-def test_changed_jobs_differ_in_their_description(scenes, tmp_path):
-    write_joints(tmp_path / "j.csv", ["lift"], {"0": [0.0]})
-    (job,) = jobs_of(scenes, STILLS)
-    audit = dataclasses.replace(job, audit=tmp_path / "j.csv", settings=AuditSettings())
-    described = [job.describe(), dataclasses.replace(job, chunk=5).describe(), audit.describe()]
-    described.append(dataclasses.replace(audit, audit=True).describe())
-    write_joints(tmp_path / "j.csv", ["lift"], {"0": [1.0]})
-    described.append(audit.describe())
-    assert [one for one in described if described.count(one) > 1] == []
-    assert described[3]["audit"] is True
-    assert described[4]["camera_file"] is None
-    assert "audit" not in described[0]
 
 
 def test_failures_are_told(scenes, out, monkeypatch):

@@ -17,7 +17,6 @@ from drake_pose.files.overlay import draw_overlay
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.jobs.estimate.inputs import (
     EstimateInputs,
-    bundled_person,
     draw_parts,
     follows_person,
     leave_out_links,
@@ -372,12 +371,11 @@ def test_persons_before_several_cameras_are_captured(studio, person, model):
 
 
 def test_models_of_persons_have_landmarks_and_a_root_that_moves(person, model, tmp_path):
-    assert missing_for_person(person) == missing_for_person(load_model(bundled_person())) == ""
+    assert missing_for_person(person) == ""
     assert "left_ankle" in missing_for_person(model)
-    path = tmp_path / "crane.urdf"
-    path.write_text(URDF)
+    (tmp_path / "crane.urdf").write_text(URDF)
     shutil.copy(person.path.with_name("landmarks.yaml"), tmp_path)
-    assert missing_for_person(load_model(path)).startswith("one root")
+    assert missing_for_person(load_model(tmp_path / "crane.urdf")).startswith("one root")
 
 
 def test_a_person_is_captured_from_masks_not_pictures(studio, person, tmp_path):

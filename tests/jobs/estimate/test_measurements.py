@@ -86,39 +86,6 @@ def test_measured_positions_are_read_by_frame(tmp_path):
         read_measured_positions(written(path, "frame,b,d\n3,0.5,-1\n"), ABC)
 
 
-MODEL = SimpleNamespace(
-    position_names=("bend", "swing", "reach", "turn"),
-    position_kinds=("angle", "angle", "length", "angle"),
-    lower=np.array([-1.0, -2.0, 0.1, -3.1]), upper=np.array([2.0, 2.0, 0.3, 3.1]),
-    is_unlimited_angle=np.array([False, False, False, True]), couplings=(),
-)  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    ("columns", "rows", "scale", "told"),
-    [
-        ("bend", [[0.0], [2.09], [-1.09]], 1.0, None),
-        ("bend", [[0.0], [2.11]], 1.0, "gives 2.11 rad in frame 1, outside the joint's limits"),
-        ("turn", [[99.0]], 1.0, None),
-        ("bend,swing", [[30.0, 9.0], [90.0, -80.0]], np.pi / 180, "assumed to be in deg"),
-        ("bend,reach", [[0.1, np.nan]], None, "column 'reach', frame 0: nan is no joint"),
-        ("turn", [[-2e6]], None, "column 'turn', frame 0: -2e.06 is no joint position"),
-    ],
-)
-def test_tables_are_in_radians_and_metres_unless_limits_tell_another_unit(
-    tmp_path, columns, rows, scale, told
-):
-    lines = [f"{k},{','.join(map(str, row))}" for k, row in enumerate(rows)]
-    path = written(tmp_path / "t.csv", "\n".join([f"frame,{columns}", *lines]))
-    if scale is None:
-        with pytest.raises(SceneError, match=told):
-            read_measured_positions(path, MODEL)
-        return
-    found = read_measured_positions(path, MODEL)
-    np.testing.assert_allclose(found.positions, scale * np.array(rows), atol=1e-12)
-    assert told in found.warnings[0] if told else found.warnings == ()
-
-
 def test_a_table_of_estimates_is_read_with_its_base(tmp_path):
     """Rows without a pose are skipped; the base is apart from the positions."""
     base, fit = ",".join(BASE_COLUMNS), ",".join(FIT_COLUMNS)
@@ -290,13 +257,10 @@ def test_pictures_of_other_cameras_are_synchronised(
 
 
 def test_rows_belong_to_pictures_by_time_or_name():
-    """With a time offset, and without times by the frames' names."""
     timed = JointLog(("a",), np.arange(3.0), np.array([[0.0], [1.0], [4.0]]))
-    named = replace(timed, times=None, frames=("0", "1", "2"))
-    camera = stream("a", [0.0, 1.0, 2.0])
-    kept = np.array([0, 1])
-    untimed = stream("a", [np.nan] * 3)
+    named, camera = replace(timed, times=None, frames=("0", "1", "2")), stream("a", [0.0, 1.0, 2.0])
+    untimed, kept = stream("a", [np.nan] * 3), np.array([0, 1])
     pairs = ((timed, camera), (named, camera), (timed, untimed))
     assert [is_timed(*pair) for pair in pairs] == [True, False, False]
-    assert rows_of(timed, camera, kept, np.array(0.5)).ravel().tolist() == [0.5, 2.5]
-    assert rows_of(named, camera, kept, np.array(0.5)).ravel().tolist() == [0.0, 1.0]
+    rows = [rows_of(log, camera, kept, np.array(0.5)).ravel().tolist() for log in (timed, named)]
+    assert rows == [[0.5, 2.5], [0.0, 1.0]]

@@ -124,42 +124,6 @@ def test_an_interrupted_estimate_is_continued(estimated, swinging, out):
         np.testing.assert_allclose(one.q, other.q, atol=np.radians(1.0))
 
 
-def test_stills_are_searched_each_by_itself(swinging):
-    """Held joints stay; the published search has samples 10 degrees apart; nothing is written."""
-    settings = EstimateSettings(
-        method="paper", hold={"lift": 20.0}, frames=("0:1",), track=False, cameras=("side",)
-    )
-    result = estimate_scene(swinging.folder, swinging.model, None, settings)
-    lift, luff = np.degrees([one.q for one in result.records.values()]).T
-    np.testing.assert_allclose(lift, 20.0, atol=1e-5)
-    np.testing.assert_allclose(luff, 10.0 * np.round(luff / 10.0), atol=1e-5)
-    for record in result.records.values():
-        assert record.stopped_by != TRACKED
-        assert record.runs >= 3
-        assert len(record.outside_limit) == 1
-    assert (result.folder, result.summary["method"]) == (None, "paper")
-
-
-def test_another_root_with_a_position_for_each_frame(own_scene, out):
-    """The base then stands where the plant has it."""
-    model = load_model(own_scene.model)
-    context, jib = model.plant.CreateDefaultContext(), model.plant.GetBodyByName("jib")
-    lines = ["frame,joint,x,y,z"]
-    for frame, q in own_scene.truth.items():
-        model.plant.SetPositions(context, q)
-        place = model.plant.EvalBodyPoseInWorld(context, jib).translation()
-        lines.append(",".join([frame, "hook", *map(str, place)]))
-    centres = own_scene.folder / "centres.csv"
-    centres.write_text("\n".join(lines))
-    root = ["--root", "jib", "--root-position", f"{centres}:hook", "--root-rotation", "x=-180:180"]
-    run_estimate(own_scene, out, "--method", "paper", *root, "--no-replay")
-    for row, q in zip(read_rows(out / "poses.csv"), own_scene.truth.values(), strict=True):
-        np.testing.assert_allclose([float(row[name]) for name in NAMES], q, atol=1e-8)
-        place = [float(row[f"base_{axis}"]) for axis in "xyz"]
-        assert place == pytest.approx([0, 0, 0], abs=1e-8)
-        assert abs(float(row["base_qw"])) == pytest.approx(1.0)
-
-
 def test_frames_without_a_pose(own_scene, out, monkeypatch):
     strict = partial(PaperSearchSettings, outside_limit=0.0)
     monkeypatch.setattr("drake_pose.jobs.estimate.inputs.PaperSearchSettings", strict)

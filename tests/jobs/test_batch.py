@@ -10,7 +10,7 @@ import pytest
 from drake_pose.errors import OutputError
 from drake_pose.jobs.batch import run_batch
 from drake_pose.jobs.batch_tasks import Outcome, Task, perform, plan_scene
-from tests.files.test_report_page import require_plain_page
+from tests.files.test_page import require_plain_page
 from tests.jobs.batches import BOTH, STILLS, finish, jobs_of, rows
 from tests.jobs.scenes import read_rows
 from tests.registration.episodes import painted_episode

@@ -12,7 +12,7 @@ from scipy.stats import chi2
 from drake_pose.camera.camera_files import describe_camera, load_cameras
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.jobs.episodes_table import COLUMNS, batch_page, episodes_table
-from tests.files.test_report_page import require_plain_page
+from tests.files.test_page import require_plain_page
 
 HOME, BUMPED = [1.0, 0.0, 0.5], [1.0, 0.02, 0.5]
 

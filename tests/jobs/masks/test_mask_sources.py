@@ -9,7 +9,7 @@ from drake_pose import MaskSettings, load_scene, make_masks
 from drake_pose.errors import CameraError, SceneError
 from drake_pose.jobs.mask_sources import open_source
 from tests.camera.recordings import numbered, write_film
-from tests.camera.test_data_sets import LENGTHS, write_v21
+from tests.camera.test_lerobot import LENGTHS, write_shared_files
 from tests.jobs.masks.rooms import box, save, save_rig, square, write_coco, write_masks
 
 AREA = [(3, box(10))]
@@ -132,7 +132,7 @@ def test_videos_of_masks_are_a_sequence(tmp_path, out):
 
 
 def test_an_episode_of_a_data_set_is_a_source(tmp_path, out):
-    write_v21(tmp_path)
+    write_shared_files(tmp_path)
     with pytest.raises(SceneError, match="choose an episode"):
         open_source(tmp_path, None, None)
     result = make_masks(tmp_path, out, MaskSettings(background="median", episode=1))

@@ -16,7 +16,7 @@ from drake_pose.jobs.registration.audit import SceneAudit, audit_scene
 from drake_pose.jobs.registration.result import corrected
 from drake_pose.registration.findings import Finding
 from tests.cli import Result, run_to_end
-from tests.files.test_report_page import require_plain_page
+from tests.files.test_page import require_plain_page
 from tests.jobs.registration.arm_scenes import JOINTS, ArmScene, write_arm_scene
 from tests.registration.arm_pictures import shifted
 from tests.written_files import write_mask

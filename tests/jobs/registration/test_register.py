@@ -20,7 +20,7 @@ from drake_pose.jobs.registration.register import register_scene
 from drake_pose.registration.register import CameraSearch
 from drake_pose.silhouette.pictures.scenes import load_scene
 from tests.cli import Result, assert_refused, run_command, run_json, run_to_end
-from tests.files.test_report_page import require_plain_page
+from tests.files.test_page import require_plain_page
 from tests.jobs.registration.arm_scenes import ArmScene, pose_errors
 from tests.jobs.scenes import write_truth
 from tests.search.arms import arm_tree

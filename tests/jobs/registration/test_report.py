@@ -8,7 +8,7 @@ import pytest
 from drake_pose.jobs.registration.pages import registration_page
 from drake_pose.jobs.registration.tracks import describe_pictures
 from drake_pose.registration.recording import TimeOffset
-from tests.files.test_report_page import require_plain_page
+from tests.files.test_page import require_plain_page
 from tests.search.arms import arm_cameras
 
 

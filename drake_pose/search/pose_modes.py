@@ -104,7 +104,7 @@ def cluster_samples(sampled: SampledTree, node: int, samples: np.ndarray) -> np.
     )
     turns = np.where(around, 2.0 * np.pi / steps, 0.0)
     scaled = np.where(turns > 0.0, np.mod(scaled, np.where(turns > 0.0, turns, 1.0)), scaled)
-    tree = cKDTree(scaled - np.where(turns > 0.0, 0.0, scaled.min(axis=0)), boxsize=turns)
+    tree = cKDTree(scaled, boxsize=turns)
     near = tree.query_pairs(1.01, p=np.inf, output_type="ndarray")
     # Different values give the same pose where two axes coincide.
     X_PN = sampled.X_PN[node][samples, :3].reshape(len(samples), -1)

@@ -97,8 +97,8 @@ def test_discs_contain_a_part_at_all_joint_values(maker, parts_of):
                     vertices = body.surfaces.rigid[node].vertices
                     uv, _ = view.camera.project(vertices @ X_WN[:3, :3].T + X_WN[:3, 3])
                     far.append(np.linalg.norm(uv - [x, y], axis=1).max())
-            slides = body.kinematics.is_angle[np.isin(body.kinematics.value_nodes, part.nodes)]
-            if slides.all():
+            turns = body.kinematics.is_angle[np.isin(body.kinematics.value_nodes, part.nodes)]
+            if turns.all():
                 assert 0.55 * r < max(far) < 1.001 * r
     np.testing.assert_allclose(search.errors_near(problem, start), errors, rtol=0.2, atol=12.0)
 

@@ -116,7 +116,6 @@ def test_contours_and_the_renderers_tolerance(flipping_body):
     mask[60:, 10:12] = True
     view = View(flipping_body.cameras[0], mask)
     assert contour_length([view, view]) == 2 * (2 * 20 + 2 * 8 + 20)
-    # A thousandth of the pixels differ: .076, and five standard deviations, .276 each.
     assert renderer_tolerance([view]) == math.floor(0.076 + 5.0 * 0.076**0.5 + 1.0) == 2
     assert renderer_tolerance([view] * 20) == math.floor(1.52 + 5.0 * 1.52**0.5 + 1.0) == 8
 

@@ -108,7 +108,6 @@ def test_a_body_that_a_camera_cannot_show_is_refused():
         (PINHOLE, [(0, 0, 3), (0.1, 0.2, 0.3)], "'eye' is inside"),
         (PINHOLE, [(50, 0, 3)], "'eye'.*outside the picture"),
         (PARALLEL, [(0, 50, 3)], "'flat'.*outside the picture"),
-        # A diagonal is 80 pixels, and a body may be ten of it: 40 or 46 m of 20 pixels.
         (PARALLEL, [(0, 0, 3), (38, 0, 3)], None),
         (PARALLEL, [(0, 0, 3), (45, 0, 3)], "'flat'.*larger than the picture"),
         (PINHOLE, [(0, 0, 3), (50, 0, 3)], "'eye'.*larger than the picture"),
@@ -117,10 +116,12 @@ def test_a_body_that_a_camera_cannot_show_is_refused():
         X_CN[:, :3, 3] = places
         with nullcontext() if refused is None else pytest.raises(CameraError, match=refused):
             require_visible([CUBE] * len(places), X_CN, camera)
-    # Nodes without a surface count nowhere.
-    far = np.tile(np.eye(4), (2, 1, 1))
-    far[:, 2, 3] = 3.0, -9e9
-    require_visible([CUBE, outline_from_mesh(TriangleMesh.empty())], far, PINHOLE)
+    # A wall half a metre ahead encloses nothing, and nodes without a surface count nowhere.
+    wall = TriangleMesh(np.array([[-1.0, -1, 0], [1, -1, 0], [0, 1, 0]]), np.array([[0, 1, 2]]))
+    surfaces = [CUBE, *map(outline_from_mesh, (TriangleMesh.empty(), wall))]
+    X_CN = np.tile(np.eye(4), (3, 1, 1))
+    X_CN[:, 2, 3] = 3.0, -9e9, 0.5
+    require_visible(surfaces, X_CN, PINHOLE)
 
 
 BALL = trimesh.creation.icosphere(3)

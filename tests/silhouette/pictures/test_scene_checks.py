@@ -171,7 +171,7 @@ def test_world_with_wrong_up_axis_is_reported(turn, name):
     X[:3, :3] = Rotation.from_rotvec(turn, degrees=True).as_matrix()
     (warning,) = check_upright([camera.with_pose(X @ camera.X_WC) for camera in cameras])
     assert f"is the world's {name}," in warning
-    # A camera that looks straight down says nothing about the world.
+    # Up in the picture of a camera that looks straight down is y; opposite cameras' ups cancel.
     assert check_upright([ParallelCamera("top", 9, 9, 1.0, 4.0, 4.0, np.diag([1, -1, -1, 1]))])
     down = np.eye(4)
     down[:3, :3] = Rotation.from_rotvec([0.25 * np.pi, 0, 0]).as_matrix() @ np.diag([1, -1, -1])

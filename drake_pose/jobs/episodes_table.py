@@ -58,10 +58,12 @@ def episodes_table(
         moves = dict[str, tuple[Any, ...]]()
         for name, one in found.items():
             own, last = poses.setdefault(name, []), before.get(name)
+            # Poses in the world or on a link are compared with those in the same frame only.
+            in_order = [k for k in dict.fromkeys((last, *own)) if k and k.link == one.get("link")]
+            last = last if last in in_order else None
             shared: _CombinedPose | None = None
             p_value: float | None = None
-            if last is not None:
-                in_order = [last, *(k for k in own if k is not last)]
+            if in_order:
                 p_values = [k.compare(one)[2] for k in in_order]
                 best = 0 if p_values[0] >= DIAGNOSIS.significance else int(np.argmax(p_values))
                 p_value = p_values[best]
@@ -72,7 +74,8 @@ def episodes_table(
             is_moved = "" if last is None else "no" if shared is last else "yes"
             moves[name] = (shift, turn, is_moved, own.index(shared) + 1, p_value)
             now[name] = shared
-        if any(move[2] == "yes" for move in moves.values()):
+        rides = (before[k].link != one.get("link") for k, one in found.items() if k in before)
+        if any(move[2] == "yes" for move in moves.values()) or any(rides):
             files.append(now)
         files[-1] = now
         for name, move in moves.items():
@@ -167,6 +170,7 @@ def _displacements(episodes: Mapping[str, Mapping[str, Any]]) -> list[Figure]:
         found = dict[str, tuple[float, float]]()
         for name, one in episodes[scene]["cameras"].items():
             X_WC = np.array(one["X_WC"])
+            name += f" on {one['link']}" if one.get("link") else ""
             off = pose_difference(X_WC, first.setdefault(name, X_WC))
             turn, shift = np.degrees(np.linalg.norm(off[:3])), 1e3 * np.linalg.norm(off[3:])
             found[f"{name}: shift [mm]"] = float(shift), one["translation_sd_mm"]
@@ -199,7 +203,7 @@ class _CombinedPose:
     """
 
     def __init__(self, one: FoundCamera) -> None:
-        self._first, self._surest = np.array(one["X_WC"]), one
+        self._first, self._surest, self.link = np.array(one["X_WC"]), one, one.get("link")
         self._count, self._is_focal = 0, False
         self._information, self._weighted = np.zeros((6, 6)), np.zeros(6)
 

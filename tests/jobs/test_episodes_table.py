@@ -99,6 +99,11 @@ def test_a_camera_that_is_put_back_shares_its_earlier_pose():
     assert sum("(p-value" in one for one in moves) == 1
     moves = table({k: totals(HOME) for k in ("a", "b")})[2]
     assert moves == ("camera 'left' has one pose in all 2 episodes",)
+    ridden = totals(HOME)
+    ridden["cameras"]["left"]["link"] = "hand"
+    rows, files, moves = table({"a": ridden, "b": totals(HOME), "c": ridden})
+    assert not any("moved" in one for one in moves)
+    assert (column(rows, "pose"), len(files)) == (["1", "2", "1"], 3)
 
 
 def test_combined_pose_is_the_information_weighted_mean():

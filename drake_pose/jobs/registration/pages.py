@@ -31,12 +31,6 @@ from drake_pose.silhouette.pictures.scene_checks import frame_ranges
 DEVIATIONS = ("standard deviation", "of the rotation")
 """Headings of `_deviations`."""
 
-PARAMETERS = (
-    ("zeros", "Joint offsets, to be added to positions", "joint", "offset"),
-    ("lengths", "Link scales, relative changes of length", "link", "change"),
-)
-"""Of each kind of parameter: its key in the summary, a title, who has it, and what it is."""
-
 
 def registration_page(folder: Path, summary: Mapping[str, Any]) -> Page:
     """Return the page of a registration.
@@ -46,7 +40,8 @@ def registration_page(folder: Path, summary: Mapping[str, Any]) -> Page:
     cameras = summary["cameras"]
     # The robot's parameters are the same in the parts of all cameras.
     first = next(iter(cameras.values()))
-    pictures, pairs, frames = list[Figure](), list[Figure](), list[Table]()
+    pairs, frames = list[Figure](), list[Table]()
+    pictures: dict[str, list[Figure]] = {"points": [], "contours": [], "silhouettes": []}
     for name, one in cameras.items():
         # From the worst frame to the best; without a silhouette by the points that do not fit.
         fits = one["frames"]
@@ -64,7 +59,8 @@ def registration_page(folder: Path, summary: Mapping[str, Any]) -> Page:
             for kind, of in kinds
         )
         drawn = evenly_spaced([place for place in own if (folder / place).is_file()], 6)
-        pictures += picture_files(folder, {place: own[place] for place in drawn})
+        section = {"none": "points", "found": "contours"}.get(one["masks"], "silhouettes")
+        pictures[section] += picture_files(folder, {place: own[place] for place in drawn})
         pairs += picture_files(folder, given)
         frames.append(Table(
             ["frame", "E_total", "IoU", "inlier ratio", "result"],
@@ -74,7 +70,6 @@ def registration_page(folder: Path, summary: Mapping[str, Any]) -> Page:
             f"{name}: {len(fits)} frames",
         ))  # fmt: skip
     clocks = [_clock(name, one) for name, one in cameras.items() if "time_offset_scores" in one]
-    kinds_of_pictures = {"none": "points", "found": "contours"}
     return Page(
         scene_title(summary),
         f"Camera poses of {scene_title(summary)}, model {Path(str(summary['model'])).name}, from "
@@ -83,7 +78,7 @@ def registration_page(folder: Path, summary: Mapping[str, Any]) -> Page:
         summary,
         {
             "as_given": [pairs],
-            kinds_of_pictures.get(first["masks"], "silhouettes"): [pictures],
+            **{section: [own] for section, own in pictures.items()},
             "registered": [camera_table(cameras)],
             "parameters": robot_tables(cameras),
             "clocks": [clocks],
@@ -148,7 +143,10 @@ def robot_tables(cameras: Mapping[str, Mapping[str, Any]]) -> list[Table]:
     first = next(iter(cameras.values()))
     tables = [
         Table([of, what, "95 % interval", "significance"], parameter_rows(first[key]), title)
-        for key, title, of, what in PARAMETERS
+        for key, title, of, what in (
+            ("zeros", "Joint offsets, to be added to positions", "joint", "offset"),
+            ("lengths", "Link scales, relative changes of length", "link", "change"),
+        )
         if first[key]
     ]
     if one := first.get("target"):

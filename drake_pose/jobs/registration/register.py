@@ -315,8 +315,7 @@ class _Registration:
                 self.warnings += picture_warnings(result, name in inputs.assumed_focal)
                 self._note(result.found, start)
                 start = time.perf_counter()
-            unexplained = [name for name in inputs.recordings if name not in self.pictures]
-            self.inputs = replace(inputs, frames=tuple(frames)).without(unexplained)
+            self.inputs = replace(inputs, frames=tuple(frames))
         self._require_registered()
 
     @contextmanager

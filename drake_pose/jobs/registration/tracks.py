@@ -99,11 +99,9 @@ def _say_riding(inputs: RegistrationInputs, name: str, carrying: Sequence[str]) 
     """
     moving = [one.name for one in inputs.tree.nodes[1:] if one.parent >= 0]
     named = carrying or moving
-    why = (
-        "its pictures do not tell them apart"
-        if carrying
-        else ("too little is found again in its pictures to tell which")
-    )
+    why = "too little is found again in its pictures to tell which"
+    if carrying:
+        why = "its pictures do not tell them apart"
     return (
         f"camera '{name}' moves with the robot: next to nothing of its background stays where it "
         f"is. It rides on link {' or '.join(named)}; {why}: name it (--on LINK --camera {name}). "

@@ -22,7 +22,6 @@ from drake_pose.silhouette.pictures.scenes import load_scene
 from tests.cli import Result, assert_refused, run_command, run_json, run_to_end
 from tests.files.test_page import require_plain_page
 from tests.jobs.registration.arm_scenes import ArmScene, pose_errors
-from tests.jobs.scenes import write_truth
 from tests.search.arms import arm_tree
 
 
@@ -194,16 +193,3 @@ def test_too_few_frames_are_refused_before_the_search(own_arm, out, monkeypatch)
     words = own_arm.register(out)
     assert_refused(run_command([*words, "--zeros", "all", "--frame", "0000"]), "more frames")
     assert not out.exists()
-
-
-def test_several_poses_are_warned_of_with_the_joint_to_move(tiny_scene, tmp_path, out):
-    """A planar arm looks the same from two places."""
-    joints = write_truth(tiny_scene, tmp_path / "joints.csv")
-    arm = ArmScene(tiny_scene.folder, tiny_scene.model, joints, {})
-    words = [*arm.register(out), "--no-overlay", "--camera", "front"]
-    for gone in ("--suggest", "--keep-out"):
-        assert_refused(run_command([*words, gone]), "the warning of several poses names", status=2)
-    found = run_to_end(*words, "--json")
-    assert len(json.loads(found.stdout)["modes"]) > 1
-    assert "other poses fit equally well" in found.stderr
-    assert "add frames in which joint" in found.stderr

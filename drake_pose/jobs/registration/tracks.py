@@ -394,18 +394,17 @@ def draw_tracks(
     folder: Path,
     result: TrackRegistration,
     given: PinholeCamera | None = None,
-    most: int = 6,
     prefix: str = "",
 ) -> None:
-    """Draw inlier points in blue and outliers in orange, in up to `most` pictures.
+    """Draw inlier points in blue and outliers in orange, in up to six pictures.
 
     folder: the result folder. given: the camera at its given pose on the link; None: none is given.
     With it, the points as seen from there (blue) and from the pose found (orange) are drawn, too.
-    most: number of pictures. prefix: of the files' names, before the frame's.
+    prefix: of the files' names, before the frame's.
     """
     found, frames, blue = result.found.camera, result.found.frames, (0, 114, 178)
     worst = sorted(range(len(frames)), key=lambda k: frames[k].inlier_ratio)
-    for k in evenly_spaced(worst, most):
+    for k in evenly_spaced(worst, 6):
         name, rows, uv = frames[k].frame, result.seen.frames == k, result.seen.uv
         fits, off = rows & result.inliers, rows & ~result.inliers
         drawn = {OVERLAY: ((uv[fits], blue), (uv[off], EXCESS_RGB))}

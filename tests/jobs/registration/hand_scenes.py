@@ -14,7 +14,6 @@ from drake_pose.camera.camera_files import save_cameras
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.jobs.registration.arm_scenes import ArmScene
-from tests.registration.arm_pictures import damaged
 from tests.search.arms import LINKS, arm_urdf
 from tests.written_files import write_mask
 
@@ -47,7 +46,6 @@ BRACKET = """<visual><geometry><box size="0.2 0.12 0.03"/></geometry></visual>
   <visual><origin xyz="-0.07 0.02 0.07"/><geometry><box size="0.05 0.08 0.12"/></geometry></visual>
   <visual><origin xyz="0.06 -0.04 0.04"/>
     <geometry><cylinder radius="0.02" length="0.06"/></geometry></visual>"""
-CAN = '<visual><geometry><cylinder radius="0.06" length="0.18"/></geometry></visual>'
 
 
 @dataclass(frozen=True)
@@ -126,36 +124,19 @@ def write_hand_scene(
     return TargetScene(arm, target, X_WT)
 
 
-def damage_masks(folder: Path, seed: int, wrong: str) -> None:
-    """Dilate or erode masks by up to two pixels, add holes of 3 %, and mirror the mask `wrong`."""
-    rng = np.random.default_rng(seed)
-    for path in sorted(folder.glob("*.png")):
-        mask = damaged(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) > 0, rng, (2, 6))
-        write_mask(path, mask[::-1, ::-1] if path.name == wrong else mask)
-
-
 def paint_pictures(folder: Path, seed: int = 0) -> None:
-    """Replace a scene's masks by pictures of the target in front of changing clutter.
+    """Replace a scene's masks by pictures of a light grey target in front of changing clutter.
 
-    The target is grey, brighter at the top left; the background has grain and boxes of other
-    colours. Each picture has noise with a standard deviation of 4 of 255.
+    Each picture has noise with a standard deviation of 4 of 255.
     """
     rng = np.random.default_rng(seed)
+    (folder / "images" / "wrist").mkdir(parents=True)
     for path in sorted((folder / "masks" / "wrist").glob("*.png")):
         mask = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) > 0
-        height, width = mask.shape
-        grain = cv2.GaussianBlur(rng.normal(0.0, 1.0, (height, width)), (0, 0), 12.0, 3.0)
-        picture = np.array([150.0, 110.0, 70.0]) + 20.0 * (grain / grain.std())[..., None]
-        for _ in range(6):
-            corner, size = rng.uniform(0.0, [width, height]), rng.uniform(0.05, 0.4, 2) * width
-            box = cv2.boxPoints((corner.tolist(), size.tolist(), rng.uniform(0.0, 90.0)))
-            cv2.fillPoly(picture, [box.astype(np.int32)], rng.uniform(20.0, 160.0, 3).tolist())
-        light = np.linspace(1.0, 0.85, height)[:, None] * np.linspace(1.0, 0.85, width)
+        patches = rng.uniform(20.0, 160.0, (12, 16, 3))
+        clutter = cv2.resize(patches, mask.shape[::-1], interpolation=cv2.INTER_LINEAR)
         soft = cv2.GaussianBlur(mask.astype(float), (0, 0), 0.7)[..., None]
-        shown = np.array([200.0, 205.0, 215.0]) * light[..., None]
-        picture = soft * shown + (1.0 - soft) * picture + rng.normal(0.0, 4.0, picture.shape)
-        (folder / "images" / "wrist").mkdir(parents=True, exist_ok=True)
-        image = folder / "images" / "wrist" / path.name
-        cv2.imwrite(str(image), np.clip(picture[..., ::-1], 0, 255).astype(np.uint8))
-        path.unlink()
+        picture = soft * np.array([215.0, 205.0, 200.0]) + (1.0 - soft) * clutter
+        noisy = picture + rng.normal(0.0, 4.0, picture.shape)
+        cv2.imwrite(str(folder / "images" / "wrist" / path.name), np.clip(noisy, 0, 255))
     shutil.rmtree(folder / "masks")

@@ -61,6 +61,7 @@ class TestAudit:
         assert summary["frames"]["0003"]["agrees"]
         assert summary["principal_point_px"] is None
         assert summary == json.loads((out / "summary.json").read_text())
+        assert {path.name for path in out.rglob("*.png")} == {"0002.png"}
 
     def test_a_scene_s_own_table_is_used(self, audited, found, tmp_path) -> None:
         own, (_, summary) = audited.copy(tmp_path), found
@@ -77,12 +78,6 @@ class TestAudit:
         table.unlink()
         with pytest.raises(SettingsError, match="positions of all joints"):
             audit_scene(own.folder, own.model)
-
-    def test_only_outliers_are_drawn(self, found) -> None:
-        drawn = {str(path.relative_to(found[0])) for path in found[0].rglob("*.png")}
-        overlays = {f"{one}/0002.png" for one in ("overlay/left", "overlay/right")}
-        as_given = {f"overlay_as_given/{one}/0002.png" for one in ("left", "right")}
-        assert drawn - as_given == overlays
 
     def test_page_shows_intervals_and_minimum_detectable_offsets(self, audited, tmp_path):
         """The elbow's encoder reads two degrees too high; the correction is -2 degrees."""
@@ -101,10 +96,8 @@ class TestAudit:
         for name, least in summary["minimum_detectable"].items():
             (row,) = (row for row in rows if row.startswith(f"<td>{name}</td>"))
             assert ("none" if least is None else f"{least:.2g}") in row
-        for camera in ("left", "right"):
-            assert f"<td>{camera}</td>" in text
-            places = out.glob(f"overlay_as_given/{camera}/*.png")
-            assert {path.stem for path in places} >= {"0003", "0004"}
+        places = out.glob("overlay_as_given/left/*.png")
+        assert {path.stem for path in places} >= {"0003", "0004"}
 
     def test_wrong_camera_pose_is_found(self, audited, tmp_path: Path) -> None:
         """The given pose of one camera is off by 2 cm."""
@@ -116,18 +109,17 @@ class TestAudit:
         assert result.summary["findings"][0]["shift_mm"] == pytest.approx(20.0, abs=5.0)
         assert result.folder is None
 
-    @pytest.mark.parametrize("half", [0.5, pytest.param(-0.5, marks=pytest.mark.slow)])
-    def test_half_pixel_error_of_principal_points_is_reported(self, audited, tmp_path, half):
+    def test_half_pixel_error_of_principal_points_is_reported(self, audited, tmp_path):
         moved = {
-            name: replace(one, center_x=one.center_x + half, center_y=one.center_y + half)
+            name: replace(one, center_x=one.center_x + 0.5, center_y=one.center_y + 0.5)
             for name, one in audited.cameras.items()
         }
         result = audit_with(audited, moved, tmp_path)
         told, warnings = result.summary["principal_point_px"], "\n".join(result.warnings)
         assert [one["name"] for one in result.summary["findings"]] == ["0002"]
-        np.testing.assert_allclose(told["offset"], -half, atol=0.15)
+        np.testing.assert_allclose(told["offset"], -0.5, atol=0.15)
         assert "half a pixel" in warnings
-        assert ("CameraInfo's numbers" in warnings) == (half > 0.0)
+        assert "CameraInfo's numbers" in warnings
 
     def test_unknown_cameras_are_refused(self, audited, tmp_path: Path) -> None:
         own = audited.copy(tmp_path)

@@ -5,13 +5,11 @@ import json
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 
 from drake_pose.camera.camera_files import load_cameras, save_cameras
 from drake_pose.errors import DrakePoseError
-from drake_pose.files.overlay import EXCESS_RGB, MISSING_RGB
 from drake_pose.files.settings import RegistrationSettings
 from drake_pose.jobs.registration.inputs import RegistrationInputs, read_inputs
 from drake_pose.jobs.registration.register import register_scene
@@ -46,15 +44,6 @@ def run(command: str, episode, out: Path, *more: object) -> dict[str, Any]:
     result = run_command([str(word) for word in words])
     assert result.exit_code == 0, result.output
     return json.loads((out / "summary.json").read_text())
-
-
-@pytest.mark.parametrize("command", ["estimate", "register", "audit", "capture"])
-def test_a_folder_of_recordings_names_them(episode, tmp_path, command):
-    scene, painted = episode
-    model = [] if command == "capture" else ["--model", str(painted.path)]
-    result = run_command([command, str(scene.parent), *model, "--out", str(tmp_path / "out")])
-    assert result.exit_code == 1
-    assert "give one of its subfolders: scene" in " ".join(result.output.split())
 
 
 def test_log_is_interpolated_at_the_pictures_times(episode):
@@ -153,18 +142,10 @@ def test_an_episode_becomes_a_calibrated_scene(episode, out):
     assert set(rows) == set(masks.frames)
     told = [[float(rows[frame][name]) for name in NAMES] for frame in masks.frames]
     np.testing.assert_allclose(told, painted.values[list(map(int, masks.frames))], atol=0.02)
-    assert (out / "overlay" / "camera" / f"{masks.frames[0]}.png").is_file()
-    # The camera file has the true pose, so both contours coincide.
     errors = {frame: one["E_total"] for frame, one in summary["frames"].items()}
     in_order = sorted(errors, key=lambda frame: -errors[frame])
     given = sorted((out / "overlay_as_given" / "camera").glob("*.png"))
     assert [one.stem for one in given] == sorted({in_order[0], in_order[len(in_order) // 2]})
-    picture = cv2.imread(str(given[0]))[..., ::-1]
-    found, was = ((picture == rgb).all(axis=2) for rgb in (EXCESS_RGB, MISSING_RGB))
-    # Above the legend.
-    near = cv2.dilate(found[:-38].astype(np.uint8), np.ones((25, 25)))
-    assert found[-38:].any()
-    assert near[was[:-38]].mean() > 0.95
     anew = RegistrationSettings(cameras=("camera",))
     again = register_scene(out, painted.path, out / "joint_angles.csv", settings=anew)
     error = pose_error(again.registered["camera"].camera.X_WC, painted.camera.X_WC)

@@ -1,6 +1,7 @@
 """`drake-pose register`: a camera file with poses, from masks and joint positions."""
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,11 +18,10 @@ from drake_pose.files.overlay import EXCESS_RGB, MISSING_RGB
 from drake_pose.files.settings import RegistrationSettings
 from drake_pose.jobs.registration.positions import joint_shifts
 from drake_pose.jobs.registration.register import register_scene
-from drake_pose.registration.register import CameraSearch
 from drake_pose.silhouette.pictures.scenes import load_scene
-from tests.cli import Result, assert_refused, run_command, run_json, run_to_end
+from tests.cli import Result, run_json, run_to_end
 from tests.files.test_page import require_plain_page
-from tests.jobs.registration.arm_scenes import ArmScene, pose_errors
+from tests.jobs.registration.arm_scenes import pose_errors
 from tests.search.arms import arm_tree
 
 
@@ -58,10 +58,8 @@ class TestRegister:
         assert list(found["cameras"]) == ["left"]
         for name in ("X_WC", "translation_sd_mm", "rotation_sd_deg", "modes", "mean_iou"):
             assert found[name] == found["cameras"]["left"][name]
-        assert found["modes"] == [{"X_WC": found["X_WC"]}]
         assert found["mean_iou"] > 0.98
         assert (found["zeros"], found["lengths"], found["outliers"]) == ({}, {}, [])
-        assert 0.0 < found["seconds"]
         assert list(found["frames"]) == [f"{k:04d}" for k in range(5)]
         one = yaml.safe_load((out / "registration.yaml").read_text())["left"]
         covariance = np.array(one["covariance"])
@@ -77,31 +75,13 @@ class TestRegister:
         pictures = sorted((registered[0] / "overlay" / "left").glob("*.png"))
         assert [path.stem for path in pictures] == [f"{k:04d}" for k in range(5)]
         picture = cv2.imread(str(pictures[0]))[:, :, ::-1]
-        assert picture.shape[1] >= 560
         # Except for the legend, body and mask coincide.
         wrong = [(picture == rgb).all(axis=2).mean() for rgb in (MISSING_RGB, EXCESS_RGB)]
         assert max(wrong) < 0.005
         page = (registered[0] / "report.html").read_text()
         answer = require_plain_page(page, registered[1]["warnings"]).by_id["answer"]
-        assert answer.startswith("Camera left found, good to ")
-        assert answer.endswith("All 5 frames agree.")
+        assert re.fullmatch("Camera left found, good to .* All 5 frames agree.", answer)
         assert page.count("data:image/jpeg;base64,") == page.count("<tr><td>000") == 5
-        assert not (registered[0] / "overlay_as_given").exists()
-        for name in ("cameras.yaml", "registration.yaml", "summary.json", "overlay/left/0003.png"):
-            assert f'href="{name}"' in page
-            assert (registered[0] / name).is_file()
-
-
-@pytest.mark.slow
-def test_single_frame_and_wrong_known_camera_are_warned_of(own_arm: ArmScene, out: Path) -> None:
-    elsewhere = np.array(own_arm.cameras["right"].X_WC)
-    elsewhere[:3, 3] += [0.0, 0.8, 0.0]
-    own_arm.edit_cameras("right", X_WC=elsewhere.tolist())
-    result = run_to_end(*own_arm.register(out), "--frame", "2", "--json")
-    assert "camera 'right' is held at its X_WC, but the robot is not seen" in result.stderr
-    assert "--camera right" in result.stderr
-    assert "camera 'left': there is one frame, '0002'" in result.stderr
-    assert list(json.loads(result.stdout)["frames"]) == ["0002"]
 
 
 @pytest.mark.slow
@@ -124,15 +104,6 @@ class TestRecordedArms:
         # The reference has IoU 0.87 0.94 0.92 0.95 0.93 (its README).
         ious = [frame.iou for frame in one.frames]
         np.testing.assert_allclose(ious, (0.87, 0.94, 0.92, 0.95, 0.93), atol=0.01)
-
-    def test_half_outliers_are_refused(self, shared_data: Path, out: Path) -> None:
-        folder = shared_data / "franka_one_view"
-        panda = folder / "panda" / "panda.urdf"
-        scene = ArmScene(folder, panda, folder / "joint_angles.csv", {})
-        refused = run_to_end(*scene.register(out), status=1)
-        assert "8 of 10: 0002-0009" in refused.stderr
-        assert "give a scene of them alone" in refused.stderr
-        assert not out.exists()
 
 
 def body_poses(path: Path, q: np.ndarray) -> dict[str, np.ndarray]:
@@ -186,10 +157,3 @@ def test_offsets_and_scales_are_estimated_and_written_to_a_urdf(own_arm, tmp_pat
     moved += 0.34 * longer["shoulder"] * right["shoulder"][:3, 2]
     np.testing.assert_allclose(found["hand"][:3, :3], right["hand"][:3, :3], atol=1e-9)
     np.testing.assert_allclose(found["hand"][:3, 3], right["hand"][:3, 3] + moved, atol=1e-9)
-
-
-def test_too_few_frames_are_refused_before_the_search(own_arm, out, monkeypatch):
-    monkeypatch.setattr(CameraSearch, "register", None)
-    words = own_arm.register(out)
-    assert_refused(run_command([*words, "--zeros", "all", "--frame", "0000"]), "more frames")
-    assert not out.exists()

@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -11,8 +12,9 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from drake_pose.errors import RegistrationError
+from drake_pose.errors import RegistrationError, UnknownNameError, weight_of
 from drake_pose.files.overlay import EXCESS_RGB
+from drake_pose.files.settings import RegistrationSettings
 from drake_pose.fit.judge import PairedEvidence
 from drake_pose.jobs.registration.diagnosis import (
     compare_camera,
@@ -24,18 +26,30 @@ from drake_pose.jobs.registration.register import register_scene
 from drake_pose.jobs.registration.tracks import draw_tracks
 from drake_pose.jobs.registration.words import (
     common_outlier_warnings,
+    describe_common_finding,
     describe_error,
+    describe_frame_finding,
+    few_frames_warning,
     mode_warnings,
+    outlier_warnings,
+    parameter_warnings,
+    target_warnings,
     zero_warnings,
 )
-from drake_pose.registration.findings import Finding
+from drake_pose.registration.findings import Finding, FrameDiagnosis
+from drake_pose.registration.joint_offsets import KinematicParameter, undetermined
 from drake_pose.registration.picture_matches import Sightings
 from drake_pose.registration.posed_frames import PosedFrame
 from drake_pose.registration.recording import Recording, TimeOffset
-from drake_pose.registration.register import FrameMisfit, RegisteredCamera, RegistrationBody
+from drake_pose.registration.register import (
+    FrameMisfit,
+    RegisteredCamera,
+    RegistrationBody,
+    TargetPose,
+)
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.jobs.registration.arm_scenes import write_arm_scene
-from tests.registration.arm_pictures import looking_at, shifted
+from tests.registration.arm_pictures import errors, looking_at, shifted
 from tests.search.arms import arm_cameras, arm_tree
 
 DEGREE = np.radians(1.0)
@@ -58,6 +72,90 @@ def test_size_and_sign_of_an_error_are_told(kind, angle, size, below, above) -> 
         shift = 0.0 if angle else sign * 0.03
         one = Finding(kind, "a", sign * angle, shift, *deviations, 0.0, 0.0)
         assert re.search(rf"{re.escape(size)} .*{word}", describe_error(one))
+
+
+@pytest.mark.parametrize(
+    ("fields", "said"),
+    [
+        ({"kind": "sign", "link": "arm", "text": "so"}, "'a' .* other sign .*'arm' .*so, .* 2.5"),
+        ({"kind": "log", "link": "arm", "text": "so"}, "'arm' .*'a' differs .*, so, .* 2.5"),
+        ({"kind": "link", "link": "arm", "text": "so"}, "'arm' is not where the log says: so$"),
+        ({"kind": "refused", "text": "so"}, "^so$"),
+        ({"kind": "reading", "pixels": 0.0}, "^a$"),
+        ({"kind": "moved", "text": "so", "angle": DEGREE}, "'a' so, .* turns of 1.00 .* 2.5"),
+        ({"kind": "moved", "link": "base", "angle_sd": DEGREE}, "^the base was moved .* is off by"),
+        ({"kind": "moved", "link": "camera", "shift_sd": 0.1}, "^camera 'a' was moved .* 100"),
+        ({"kind": "camera", "shift": 0.03, "shift_sd": 0.004, "at_body": 0.01, "text": "; so",
+          "alternatives": ("base",)}, r"'a' \(or base: .* off by 30.0 \+- 4.0 mm \(10.0 .*; so$"),
+        ({"kind": "center", "shift": 3.0, "shift_sd": 0.4}, r"the a: off by 3.0 \+- 0.4 px in all"),
+        ({"kind": "length", "shift": -0.1, "shift_sd": 0.01}, r"link 'a' is 10.0 \+- 1.0 .* long"),
+    ],
+)  # fmt: skip
+def test_errors_of_all_frames_are_told(fields, said) -> None:
+    one = Finding(**({"kind": "", "name": "a", "pixels": 2.5} | fields))
+    assert re.search(said, describe_common_finding(one))
+
+
+def test_errors_of_single_frames_are_told() -> None:
+    frame = FrameDiagnosis("7", {"left": 0.4, "right": 0.2}, {"left": 0.4, "right": 0.2}, 1.0, None)
+    for fields, said in (
+        ({"kind": "unexplained"}, "camera 'right' 20.00 % of the contours"),
+        ({"kind": "unexplained", "text": "so"}, "^so$"),
+        ({"kind": "joint", "angle": -11 * DEGREE}, "'a' reads more than 10 degrees too high"),
+        ({"kind": "joint", "angle": 9 * DEGREE, "angle_sd": DEGREE}, "'a' reads 9.00 .* too low"),
+        ({"kind": "joints", "joints": {"b": 0.1, "c": -0.3}}, r"\(c, b most\), .* 2.5 pixels"),
+        ({"kind": "joints"}, "other joint positions than given, which"),
+    ):
+        one = Finding(**({"kind": "", "name": "a", "pixels": 2.5} | fields))
+        assert re.search(said, describe_frame_finding(frame, one))
+
+
+def test_parameters_that_are_uncertain_are_named() -> None:
+    sure = KinematicParameter("a", 0.1, 0.01, 0.08, 0.12, True)
+    turning = replace(sure, name="b", deviation=2 * DEGREE, gauge=("turn_z",))
+    loose, alone = undetermined("c", ("turn_x",)), undetermined("d", ())
+    calibration = SimpleNamespace(offsets=(sure, loose), link_scales=(turning, alone))
+    texts = parameter_warnings(calibration)
+    for text, said in zip(texts, (
+        "^link 'b': its length is good to 2 degrees .* turn_z", "^joint 'c': .* not .* with turn_x",
+        "^link 'd': .* not changed; add",
+    ), strict=True):  # fmt: skip
+        assert re.search(said, text)
+    calibration.offsets, calibration.link_scales = (replace(sure, significant=False),), ()
+    (text,) = parameter_warnings(calibration)
+    assert "none of the requested" in text
+    assert weight_of(text) == "note"
+    assert parameter_warnings(SimpleNamespace(offsets=(), link_scales=())) == []
+    poses, axes = np.zeros((2, 4, 4)), np.eye(3)[2:]
+    texts = target_warnings(TargetPose(np.eye(4), np.eye(6), poses, axes))
+    assert [weight_of(one) for one in texts] == ["note"] * 2
+    assert "0.000, 0.000, 1.000" in texts[0]
+    assert "in 2 other poses" in texts[1]
+    assert target_warnings(TargetPose(np.eye(4), np.eye(6), poses[:0], axes[:0])) == []
+
+
+def test_outliers_are_told_with_their_suspects() -> None:
+    found = registered(0.9, 0.9, 0.9, -0.2, -0.2)
+    for from_pictures, misplaced, said in (
+        (False, (), "2 of 5 .* 3-4; .* explain 3-4: check their masks .* moved after frame '2'"),
+        (True, ("3",), "explain 4: check what hides .* other frames explain 3 better"),
+        (True, ("3", "4"), "count: 3-4; the joint positions of other frames explain 3-4 better"),
+    ):
+        (text,) = outlier_warnings(found, from_pictures, misplaced)
+        assert re.search(said, text)
+        assert weight_of(text) == "check"
+    (text,) = outlier_warnings(registered(0.9, 0.9, -0.2, E=np.nan), True)
+    assert "few points of the scene fit" in text
+    assert "moved" not in text
+    half = registered(0.9, 0.9, -0.2, -0.2)
+    with pytest.raises(RegistrationError, match=r"half .* 2 of 4: 2-3.*the others, 0-1,"):
+        outlier_warnings(half)
+    (text,) = outlier_warnings(half, True)
+    assert weight_of(text) == "wrong"
+    assert "AGREE, 2 of 4: 0-1" in text
+    assert outlier_warnings(registered(0.9)) == []
+    for evidence, needed in ((None, 6), (PairedEvidence(0.5, 0.4, 0.02, 0.004, 6, 9), 9)):
+        assert few_frames_warning(registered(0.9, evidence=evidence)).endswith(f" takes {needed}")
 
 
 def registered(*agreeing: float, E: float = 0.1, **more: Any) -> RegisteredCamera:
@@ -130,6 +228,25 @@ def test_wrong_rows_are_told_from_bad_masks(tmp_path: Path) -> None:
     told, *_ = register_scene(scene.folder, scene.model, scene.joints).warnings
     assert "explain 0004: check their masks" in told
     assert "explain 0002, 0006 better: are their joint positions" in told
+
+
+@pytest.mark.parametrize("without", [(), ("hand",)])
+def test_what_does_not_look_like_the_model_is_named_or_left_out(arm_scene, tmp_path, without):
+    """The model has another hand, to which a tip is welded."""
+    hand, text = '<box size="0.05 0.1 0.15"/>', arm_scene.model.read_text()
+    assert text.count(hand) == 1
+    tip = '<link name="tip"><visual><geometry><sphere radius="0.01"/></geometry></visual></link>'
+    tip += '<joint name="weld" type="fixed"><parent link="hand"/><child link="tip"/></joint>'
+    other = text.replace(hand, '<box size="0.3 0.03 0.1"/>').replace("</robot>", f"{tip}</robot>")
+    (model := tmp_path / "other.urdf").write_text(other)
+    run = partial(register_scene, arm_scene.folder, model, arm_scene.joints)
+    found = run(settings=RegistrationSettings(without=without))
+    texts = [one for one in found.warnings if "of the contour of link" in one]
+    assert any("'hand' (with tip)" in one for one in texts) == bool(texts) == (not without)
+    off = errors(found.cameras["left"].X_WC, arm_scene.cameras["left"].X_WC)
+    assert max(off) < 0.01
+    with pytest.raises(UnknownNameError, match="gripper"):
+        run(settings=RegistrationSettings(without=("gripper",)))
 
 
 def test_poses_that_are_not_determined_are_refused() -> None:
@@ -240,8 +357,6 @@ def test_points_are_drawn_in_the_worst_pictures(tmp_path: Any) -> None:
         assert np.abs(ring.astype(int) - colour).max() < 60
         assert not pictures[name][uv[1], uv[0]].any()
     assert not pictures["2"].any()
-    draw_tracks(tmp_path / "few", tracked, most=1)
-    assert [path.stem for path in (tmp_path / "few").glob("overlay/left/*.png")] == ["1"]
 
 
 def test_a_zero_that_nothing_shows_is_named(body: RegistrationBody) -> None:

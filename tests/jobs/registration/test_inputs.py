@@ -1,6 +1,5 @@
 """Wrong input to a registration: the message names what is wrong; mostly nothing is written."""
 
-import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -9,8 +8,6 @@ import cv2
 import numpy as np
 import pytest
 
-from drake_pose.camera.camera_files import load_cameras
-from tests.benchmarks.registration import pose_error
 from tests.cli import Result, assert_refused, run_command
 from tests.jobs.registration.arm_scenes import ArmScene
 
@@ -104,21 +101,6 @@ def test_unknown_names_are_refused(arm_scene: ArmScene, tmp_path: Path, out: Pat
     assert_refused(run(arm_scene, out, "--hold", "nose"), "NAME=NUMBER", status=2)
     (tmp_path / "letter.txt").write_text("Do not lose me.")
     assert_refused(run(arm_scene, tmp_path), "not empty")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("factor", [0.4, 0.9, 1.15])
-def test_wrong_focal_length_is_corrected(factor: float, own_arm: ArmScene, out: Path) -> None:
-    given = own_arm.cameras["left"]
-    own_arm.edit_cameras("left", focal_x=factor * given.focal_x, focal_y=factor * given.focal_y)
-    result = run(own_arm, out)
-    assert not result.exit_code, result.stderr
-    assert "camera 'left': its pictures determine a focal length" in result.stderr
-    found = load_cameras(out / "cameras.yaml")["left"]
-    assert found.focal_x == pytest.approx(given.focal_x, rel=0.03)
-    error = pose_error(found.X_WC, given.X_WC)
-    entry = json.loads((out / "summary.json").read_text())["cameras"]["left"]
-    assert 1e3 * np.linalg.norm(error[3:]) < 3.0 * entry["translation_sd_mm"]
 
 
 @pytest.mark.slow

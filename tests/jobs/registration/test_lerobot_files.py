@@ -11,10 +11,15 @@ import pytest
 
 from drake_pose.camera.lerobot_tables import camera_fields
 from drake_pose.camera.models import Lens
+from drake_pose.camera.servo_readings import Column, JointReadings, Motor, Servos
 from drake_pose.errors import CameraError, SettingsError
 from drake_pose.files.settings import AuditSettings, RegistrationSettings
 from drake_pose.jobs.registration.inputs import read_inputs
-from drake_pose.jobs.registration.lerobot_files import lerobot_files, require_data_set
+from drake_pose.jobs.registration.lerobot_files import (
+    correct_homing,
+    lerobot_files,
+    require_data_set,
+)
 from tests.registration.episodes import painted_episode
 from tests.registration.recordings import NAMES, write_episode
 
@@ -114,23 +119,62 @@ def test_the_joint_map_and_meta_are_read_with_the_data_set(recorded, tmp_path):
     assert before == {one: one.read_bytes() for one in folder.rglob("*") if one.is_file()}
 
 
-def test_the_corrected_calibration_homes_the_encoder_at_the_models_zero(recorded):
+def test_only_homing_offsets_of_the_calibration_change(recorded):
     folder, painted = recorded
     _, files, _ = export(folder, painted)
     old, new = json.loads((folder / "arm.json").read_text()), json.loads(files["lerobot/arm.json"])
-    for k, name in enumerate(NAMES):
-        before, after = old[name], new[name]
-        assert {**after, "homing_offset": before["homing_offset"]} == before
-        read = painted.values[:, k] - OFFSETS.get(name, 0.0)
-        counted = np.round(read / STEP) + 2047 + before["homing_offset"]
-        homed = counted - after["homing_offset"]
-        middle = 0.5 * (after["range_min"] + after["range_max"])
-        degrees = (homed - middle) * 360 / 4095
-        np.testing.assert_allclose(np.deg2rad(degrees), painted.values[:, k], atol=2 * STEP)
-    text = files["lerobot/README.md"]
-    shift = round(OFFSETS["joint1"] / STEP)
-    homing = old["joint1"]["homing_offset"]
-    assert f"| joint1 | {homing} | {homing - shift} | +{shift} |" in text
+    for name in NAMES:
+        homing, shift = old[name]["homing_offset"], round(OFFSETS.get(name, 0.0) / STEP)
+        assert new[name] == old[name] | {"homing_offset": homing - shift}
+        assert (
+            f"| {name} | {homing} | {homing - shift} | {shift:+d} |" in files["lerobot/README.md"]
+        )
+
+
+JOINT = JointReadings("joint", "column", np.zeros(1), -2.0, 2.0, True, False)
+
+
+@pytest.mark.parametrize("encoding", ["steps", "normalised", "deg"])
+@pytest.mark.parametrize("is_inverted", [False, True])
+@pytest.mark.parametrize(
+    ("robot", "homes", "inverts"), [("so101_follower", -1, True), ("koch_follower", 1, False)]
+)
+def test_the_middle_of_a_range_becomes_the_models_zero(
+    robot, homes, inverts, is_inverted, encoding
+):
+    """position = count + homes * homing; LeRobot inverts readings of Feetech's motors only."""
+    low, high, constant, offset = 1000, 3200, 0.15, 0.55
+    turn = -1.0 if is_inverted and inverts and encoding != "deg" else 1.0
+    middle = 0.5 * (low + high)
+    scales = {"steps": turn * STEP, "normalised": (high - low) / 200 * STEP, "deg": np.radians(1)}
+    start = constant - (turn * middle * STEP if encoding == "steps" else 0.0)
+    column = Column("column", scales[encoding], start)
+    for homing in (-1900, 20, 1900):
+        servos = Servos(robot, None, {"m": Motor(low, high, homing, is_inverted)})
+        found = correct_homing(JOINT, "m", column, offset, servos, encoding)
+        zero = middle - turn * (constant + offset) / STEP
+        moved = zero + homes * (found.after - homing)
+        assert (moved - middle + 2048) % 4096 - 2048 == pytest.approx(0.0, abs=1.0)
+        assert found.shift == round(middle - zero)
+        assert (found.before, found.reason) == (homing, "")
+        assert abs(found.after) < 2048 or not inverts
+    for joint, more, said in (
+        (JOINT, 0.2, "too far"),
+        (replace(JOINT, is_gripper=True), 0, "0 to"),
+    ):
+        kept = correct_homing(joint, "m", column, offset + more, servos, encoding)
+        assert (kept.before, kept.after, kept.shift) == (1900, 1900, 0)
+        assert said in kept.reason
+
+
+@pytest.mark.parametrize(("encoding", "sign"), [("steps", -1), ("normalised", 1)])
+def test_offsets_are_added_to_inverted_counts_of_calibrations_by_lists(encoding, sign):
+    servos = Servos("koch", None, {"m": Motor(np.nan, np.nan, 7, True)}, has_lists=True)
+    servos = replace(servos, robot="so100")
+    for scale, offset in ((STEP, 0.3), (-STEP, 0.3), (STEP, -0.3)):
+        found = correct_homing(JOINT, "m", Column("column", scale), offset, servos, encoding)
+        assert found.after == 7 + found.shift
+        assert sign * scale * found.shift == pytest.approx(offset, abs=STEP)
 
 
 def test_what_is_left_out_is_said(recorded, tmp_path):

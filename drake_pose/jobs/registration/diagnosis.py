@@ -426,7 +426,6 @@ def base_motion(placed: Sequence[tuple[Camera, RegisteredCamera]]) -> Finding | 
     of the world's origin; its pixels and p-value are 0.
 
     The cameras' motions differ by four standard deviations, 0.25 degrees and 3 mm at most.
-
     ``placed``: cameras at their given poses, and as registered.
     """
     motions = [given.X_WC @ found.camera.X_CW for given, found in placed]

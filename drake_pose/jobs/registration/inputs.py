@@ -48,6 +48,7 @@ from drake_pose.jobs.registration.positions import (
     put_on_base,
     read_known_positions,
     read_target,
+    still_links,
 )
 from drake_pose.registration.camera_motion import PictureMotion
 from drake_pose.registration.joint_offsets import (
@@ -300,7 +301,7 @@ def _read_episode(
     links = {one.name: one.link for one in chosen if one.link in robot.link_names}
     recorded = {one.name for one in chosen if one.is_posed and one.camera is not None}
     world = make_tree(robot, EstimateSettings(hold=settings.hold)) if links else None
-    for name, X_WL in _still_links(world, links) if world else ():
+    for name, X_WL in still_links(world, links) if world else ():
         del links[name]
         if name in recorded:
             known[name], placed = known[name].with_pose(X_WL @ known[name].X_WC), placed | {name}
@@ -337,21 +338,6 @@ def _read_episode(
         )
     joint_names, link_names = _select_parameters(robot, kinematics, settings)
     return replace(inputs, offset_joints=joint_names, scaled_links=link_names)
-
-
-def _still_links(tree: PoseTree, links: Mapping[str, str]) -> list[tuple[str, Array]]:
-    """Return the cameras on links that stand still, with the pose X_WL (4, 4) of the link.
-
-    tree: the robot's, in the world. links: link of each camera, by the camera's name.
-    """
-    poses, kinematics, plant = list[dict[str, Array]](), TreeKinematics(tree), tree.model.plant
-    default, context = kinematics.flatten(tree.default_values()), plant.CreateDefaultContext()
-    for values in (default, default + 0.5 * (kinematics.lower < kinematics.upper)):
-        q, X_WB = tree.positions_from(kinematics.split(values))
-        plant.SetPositions(context, q)
-        X_BL = {k: plant.GetBodyByName(v).EvalPoseInWorld(context) for k, v in links.items()}
-        poses.append({name: X_WB @ X.GetAsMatrix4() for name, X in X_BL.items()})
-    return [(name, X) for name, X in poses[0].items() if np.allclose(X, poses[1][name])]
 
 
 def _recording(

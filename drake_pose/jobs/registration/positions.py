@@ -302,6 +302,21 @@ def make_registration_tree(
     return moved, tuple(base)
 
 
+def still_links(tree: PoseTree, links: Mapping[str, str]) -> list[tuple[str, Array]]:
+    """Return the cameras on links that stand still, with the pose X_WL (4, 4) of the link.
+
+    tree: the robot's, in the world. links: link of each camera, by the camera's name.
+    """
+    poses, kinematics, plant = list[dict[str, Array]](), TreeKinematics(tree), tree.model.plant
+    default, context = kinematics.flatten(tree.default_values()), plant.CreateDefaultContext()
+    for values in (default, default + 0.5 * (kinematics.lower < kinematics.upper)):
+        q, X_WB = tree.positions_from(kinematics.split(values))
+        plant.SetPositions(context, q)
+        X_BL = {k: plant.GetBodyByName(v).EvalPoseInWorld(context) for k, v in links.items()}
+        poses.append({name: X_WB @ X.GetAsMatrix4() for name, X in X_BL.items()})
+    return [(name, X) for name, X in poses[0].items() if np.allclose(X, poses[1][name])]
+
+
 def corrected_urdf(
     model: ArticulatedModel,
     folder: Path | None,

@@ -8,7 +8,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from drake_pose.commands.main import app
 from drake_pose.errors import SettingsError
 from drake_pose.papers.kameda import (
     Causes,
@@ -26,11 +25,11 @@ from drake_pose.papers.kameda import (
 )
 from drake_pose.search import MultiStartSearch, PoseEstimate
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
-from tests.cli import CliRunner
+from tests.cli import run_command
 
 
 def reproduce(*options):
-    return CliRunner().invoke(app, ["reproduce", "kameda", *options])
+    return run_command(["reproduce", "kameda", *options])
 
 
 @pytest.fixture(scope="module")

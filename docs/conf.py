@@ -40,12 +40,7 @@ ROOT = Path(__file__).resolve().parents[1]
 project = "drake_pose"
 copyright = "the authors of drake_pose"
 version = release = __version__
-extensions = [
-    "myst_parser",
-    "sphinx.ext.autodoc",
-    "sphinx.ext.autosummary",
-    "sphinx.ext.napoleon",
-]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.napoleon"]
 root_doc = "README"
 include_patterns = ["*.md", "docs/**.md", "docs/*.rst", "tutorials/*.md", "urdf/*/*.md"]
 exclude_patterns = [".*", "build", "results"]
@@ -71,10 +66,7 @@ python_maximum_signature_line_length = 80
 
 # Names of other projects, whose references would need the network.
 nitpick_ignore_regex = [
-    (
-        "py:.*",
-        r"(np|numpy|pydrake|rich|distributed|pathlib|collections|enum|jinja2|numba)\..*",
-    ),
+    ("py:.*", r"(np|numpy|pydrake|rich|distributed|pathlib|collections|enum|jinja2|numba)\..*"),
     ("py:.*", r"(cv2|scipy|trimesh|asyncio|http|socketserver|PIL|xml|types|typing)\..*"),
     ("py:.*", r"(functools|markupsafe|matplotlib|socket)\..*"),
     ("py:.*", r"cyclopts\..*"),

@@ -26,12 +26,7 @@ from drake_pose.commands.common import (
     warn,
 )
 from drake_pose.errors import ModelError, RegistrationError, listed
-from drake_pose.files.settings import (
-    AuditSettings,
-    MaskSettings,
-    Packages,
-    RegistrationSettings,
-)
+from drake_pose.files.settings import AuditSettings, MaskSettings, Packages, RegistrationSettings
 
 if TYPE_CHECKING:
     from drake_pose.jobs.masks import SceneMasks

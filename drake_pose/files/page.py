@@ -405,10 +405,7 @@ def _pictures(folder: Path, scene: Scene, estimate: SceneEstimate) -> dict[str, 
         "own joints are determined; grey: parts whose own joints are not."
     }
     hero = [*figures(usual, 900, 2), *picture_files(folder, modes, 900)]
-    return {
-        "pose": [hero],
-        "extremes": [[x for one in others for x in figures(one, 480, 3)]],
-    }
+    return {"pose": [hero], "extremes": [[x for one in others for x in figures(one, 480, 3)]]}
 
 
 def _joints(

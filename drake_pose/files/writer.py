@@ -137,10 +137,7 @@ class ResultWriter:
         self.write_summary()
 
     def add_all(
-        self,
-        frames: Iterable[tuple[FrameRecord, Drawn]],
-        asked: Collection[str],
-        on_frame: OnFrame,
+        self, frames: Iterable[tuple[FrameRecord, Drawn]], asked: Collection[str], on_frame: OnFrame
     ) -> None:
         """Write each frame, with its overlays, as soon as it is estimated.
 

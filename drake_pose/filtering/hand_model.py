@@ -299,11 +299,7 @@ def _band(model: ArticulatedModel, link: str, low: float, high: float) -> Array:
     return band
 
 
-def _palm_rings(
-    model: ArticulatedModel,
-    palm: str,
-    height: float,
-) -> Array:
+def _palm_rings(model: ArticulatedModel, palm: str, height: float) -> Array:
     """Return a palm's outlines (2, _POINTS, 3) [m] at wrist and knuckles, in the palm's frame.
 
     ``model``: the hand. ``palm``: name of the palm's link. ``height``: height of the palm [m].

@@ -13,12 +13,7 @@ import numpy as np
 import yaml
 
 from drake_pose.arrays import Mask, Picture
-from drake_pose.camera.picture_files import (
-    SUFFIXES,
-    find_pictures,
-    natural_key,
-    read_picture,
-)
+from drake_pose.camera.picture_files import SUFFIXES, find_pictures, natural_key, read_picture
 from drake_pose.errors import (
     DrakePoseError,
     MaskError,

@@ -86,11 +86,7 @@ class BeamSearchSettings(GridSettings):
 
 
 def grow(
-    store: PoseStore,
-    partial: PartialPoses,
-    node: int,
-    width: int,
-    outside_weight: int,
+    store: PoseStore, partial: PartialPoses, node: int, width: int, outside_weight: int
 ) -> PartialPoses | None:
     """Place one more node in every partial pose and keep the best results.
 

@@ -232,10 +232,7 @@ class ContourPoints(NamedTuple):
 
 @compiled
 def sample_contour(
-    packed: PackedOutlines,
-    X_WN: np.ndarray,
-    view: tuple[np.ndarray, np.ndarray],
-    spacing: float,
+    packed: PackedOutlines, X_WN: np.ndarray, view: tuple[np.ndarray, np.ndarray], spacing: float
 ) -> ContourPoints:
     """Return points on the visible contour of the union of surfaces.
 

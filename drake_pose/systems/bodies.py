@@ -170,9 +170,10 @@ def show_in_meshcat(
         prefix: Meshcat path; the skin is in ``<prefix>/skin``.
         is_recorded: as in MeshcatSkin.
     """
-    parameters = MeshcatVisualizerParams(prefix=prefix)
+    # Cleared here, as the visualizer would clear properties of ``prefix`` at an initialization.
+    meshcat.Delete(prefix)
+    parameters = MeshcatVisualizerParams(prefix=prefix, delete_on_initialization_event=False)
     MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat, parameters)
-    # After the visualizer, which clears its part of Meshcat's tree.
     if model.skin:
         skin = ModelSkin(model)
         count = model.plant.num_positions()

@@ -47,10 +47,7 @@ SECTIONS: dict[str, tuple[str, ...]] = {
         f"python -m tests.benchmarks.episodes DATA --rooms {more}" for more in ("3", "1 --spoilt")
     ),
     "filters": ("python -m tests.benchmarks.filters",),
-    "speed": (
-        "python -m tests.benchmarks.speed",
-        "python -m tests.benchmarks.silhouette_camera",
-    ),
+    "speed": ("python -m tests.benchmarks.speed", "python -m tests.benchmarks.silhouette_camera"),
     "memory": ("python -m tests.benchmarks.memory",),
     "cluster": ("python -m tests.benchmarks.cluster",),
 }

@@ -46,6 +46,14 @@ READERS = {
 }
 
 
+@pytest.fixture
+def one_thread(monkeypatch):
+    """Let a process fork that has threads, as those of pytest-xdist have."""
+    listed = os.listdir
+    monkeypatch.setattr(os, "listdir", lambda at=".": ["1"] if "task" in str(at) else listed(at))
+
+
+@pytest.mark.usefixtures("one_thread")
 @pytest.mark.parametrize("kind", READERS)
 def test_what_a_child_process_does_is_told(tmp_path, monkeypatch, kind):
     monkeypatch.setattr(parsing, "TIME_LIMIT_SECONDS", 0.5 if kind == "hang" else 20.0)
@@ -54,6 +62,7 @@ def test_what_a_child_process_does_is_told(tmp_path, monkeypatch, kind):
         parsing.check_in_child(read, write(tmp_path, ""), {}, {})
 
 
+@pytest.mark.usefixtures("one_thread")
 def test_a_file_is_checked_once_for_each_content(tmp_path):
     def read(path, packages, limits):
         with (tmp_path / "calls").open("a") as file:

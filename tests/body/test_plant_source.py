@@ -128,9 +128,9 @@ SDF = sdf.sdf(
 MJCF = """<mujoco model="m"><worldbody><body name="a"><geom type="box" size=".1 .1 .1"/>
 <body name="b"><joint name="lead" type="slide" axis="0 1 0" ref=".05"/>
 <geom type="box" size=".1 .1 .1"/></body>
-<body name="c"><joint name="follow" type="slide" axis="0 1 0" range="-9 9"/>
+<body name="c"><joint name="follow" type="slide" axis="0 1 0" range="-9 9" ref="-.2"/>
 <geom type="box" size=".1 .1 .1"/></body></body></worldbody>
-<equality><joint joint1="follow" joint2="lead" polycoef=".4 -2 0 0 0"/></equality></mujoco>"""
+<equality><joint joint1="follow" joint2="lead" polycoef=".6 -2 0 0 0"/></equality></mujoco>"""
 
 
 @pytest.mark.parametrize(("text", "name"), [(SDF, "m.sdf"), (MJCF, "m.xml")], ids=["sdf", "mjcf"])
@@ -153,6 +153,10 @@ def test_plant_and_file_give_the_same_couplings(tmp_path):
     own = ArticulatedModel.from_plant(plant, scene_graph)
     assert plant.num_constraints() == 3
     assert own.couplings == load_model(path, check=False).couplings
+    names = own.position_names
+    found = [(names[a], names[b], multiplier, offset) for a, b, multiplier, offset in own.couplings]
+    leads = [("mirror", "lead", -1.0, 0.1), ("bend", "lead", -0.5, 0.0), ("far", "lead", 1.0, 0.0)]
+    assert found == leads
     other, scene_graph = MultibodyPlant(0.0), SceneGraph()
     own.add_to(other, scene_graph)
     other.Finalize()

@@ -159,7 +159,7 @@ def test_images_of_all_encodings_are_decoded(tmp_path):
     uyvy, yuyv = np.dstack([colours, Y]), np.dstack([Y, colours])
     plain = {
         "rgb8": picture, "bgr8": reverse, "bgra8": np.dstack([reverse, grey]), "mono8": grey,
-        "8UC3": reverse, "8UC4": np.dstack([reverse, Y]), "8UC1": mosaic, "yuv444": grey,
+        "8UC3": reverse, "8UC4": np.dstack([reverse, Y]), "8UC1": mosaic, "rgb": grey,
         "yuv422": uyvy, "uyvy": uyvy, "yuv422_yuy2": yuyv, "yuyv": yuyv,
         "nv12": np.vstack([Y, colours[::2]]), "16UC1": np.dstack([grey, grey]),
         "mono16": np.dstack([grey, grey // 20]),
@@ -169,6 +169,7 @@ def test_images_of_all_encodings_are_decoded(tmp_path):
         bag.joints("/joint_states", 0.0, x=0.0)
         for coding, pixels in plain.items():
             bag.image(f"/{coding}", 0.0, pixels, coding)
+        bag.image("/narrow", 0.0, picture, "bgra8")
         for coding, pattern in patterns.items():
             place = np.tile(np.reshape(["rgb".index(c) for c in pattern], (2, 2)), (32, 32))
             pixels = np.take_along_axis(picture, place[:, :, None], axis=2)[:, :, 0]
@@ -195,10 +196,11 @@ def test_images_of_all_encodings_are_decoded(tmp_path):
     np.testing.assert_array_equal(*bayer)
     green = cv2.cvtColor(mosaic, cv2.COLOR_BayerRGGB2RGB)[5:60, 5:60, 1]
     np.testing.assert_array_equal(bayer[0][5:60, 5:60, 1], green)
-    assert not {"16UC1", "yuv444", "mono16"} & set(episode.cameras)
+    assert not {"16UC1", "rgb", "mono16"} & set(episode.cameras)
     warnings = "\n".join(episode.warnings)
-    assert "/yuv444 is left out: 'yuv444' is not one of rgb8, bgr8" in warnings
+    assert "/rgb is left out: 'rgb' is not one of rgb8, bgr8" in warnings
     assert "/mono16, picture 0: has 16 bits per pixel, but no value above 1932 of 65535" in warnings
+    assert "/narrow, picture 0: has fewer bytes than" in warnings
     assert "/16UC1" not in warnings
     guesses = [text for text in episode.warnings if "does not tell the order of colours" in text]
     assert [text.partition(":")[0] for text in guesses] == ["/8UC3", "/8UC4"]

@@ -72,6 +72,8 @@ def test_projections_match_opencv(tmp_path):
     """Through the lens, and through the camera of undistorted images."""
     for text, name, placed, coefficients in (
         (camera_info(), "left", False, RADIAL),
+        # A skew of half a pixel at the edge of a picture is ignored.
+        (camera_info().replace("[500.0, 0.0,", "[500.0, 0.4,"), "left", False, RADIAL),
         (camera_info("rational_polynomial", np.r_[RADIAL, 0.1, 0.02, 0]), "left", False, None),
         (opencv(), "any", True, RADIAL),
         (opencv().replace("%YAML 1.2", "%YAML:1.0"), "any", True, RADIAL),  # OpenCV 4.
@@ -128,7 +130,7 @@ def test_unusable_files_are_named_with_the_supported_formats(tmp_path):
         (opencv().replace("image_height: 480\n", ""), ["image_height"]),
         (opencv()[:200], ["distortion coefficients"]),
         (kalibr("omni"), ["'cam1'", "Kalibr's 'omni'"]),
-        (toml(translation=1e3 * T), ["'left'", "2510 m", "millimetres"]),
+        (toml(translation=50 * T), ["'left'", "125 m", "millimetres"]),
         (toml(rotation=RVEC[:2]), ["rotation vector"]),
         (toml().replace("matrix = [[", "matrix = [["[:-1]), ["not a TOML file"]),
         (toml() + toml().replace("cam_0", "cam_1").split("[metadata]")[0], ["given twice"]),

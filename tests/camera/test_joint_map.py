@@ -145,6 +145,7 @@ POS = ("j1.pos", "j2.pos", "j3.pos")
         (JOINTS, HOLES, None, None, 1.0, None),
         (JOINTS, HELD, None, None, 0.2, "in rad: but as degrees they would be within"),
         (JOINTS, HELD, None, "rad", 0.2, None),
+        (JOINTS, -SWING, None, None, -1.0, None),
         (POS, HELD, LEROBOT, None, None, r"normalised .*could be radians or degrees.*--units rad"),
         (POS, SWING, SO, None, None, r"normalised .*could be radians or degrees.*--units rad"),
         (JOINTS, SWING + 1.7, None, None, None, r"'j1' is 0.9\d+ to 3.3.*and not clearly degrees"),
@@ -171,6 +172,19 @@ def test_limits_and_what_moves_tell_the_unit(names, readings, servos, units, sca
     expected = np.where(np.isnan(readings), np.nan, scale * SWING)
     np.testing.assert_allclose(found.positions, expected, atol=1e-9)
     assert told in found.warnings[0] if told else found.warnings == ()
+
+
+@pytest.mark.parametrize(
+    ("off", "told"), [(-1, "full turn off"), (1, "full turn off"), (0.6, "wrong")]
+)
+def test_the_worst_reading_beyond_the_limits_is_named(off, told):
+    """As it would be without the turn that an encoder counts too many."""
+    readings = SWING.copy()
+    readings[3, 0], readings[7, 1] = SWING[3, 0] + 2.0 * np.pi * off, 2.85
+    (said,) = map_log(JOINTS, readings, WIDE, units="rad").warnings
+    assert told in said
+    assert f"gives {readings[3, 0]:.4g} rad in row 3," in said
+    assert (f"off, {SWING[3, 0]:.4g}," in said) == ("turn" in told)
 
 
 OPEN = np.linspace(0.0, 1.0, 40)

@@ -16,6 +16,7 @@ from drake_pose.camera.models import (
     PinholeCamera,
     circle_of_cameras,
     intrinsics_warnings,
+    look_at,
 )
 from drake_pose.errors import CameraError
 
@@ -95,7 +96,7 @@ def test_invalid_parameters_are_named():
         ("center_y", ["here"]),
         ("near", [0.0, True]),
         ("X_WC", [nest, np.eye(3), np.full((4, 4), np.nan), np.array([["a"] * 4] * 4)]),
-        ("X_WC", [np.diag([1.0, 1.0, *two]) for two in [(2.0, 1.0), (-1.0, 1.0), (1.0, 2.0)]]),
+        ("X_WC", [np.diag([1.0, 1.0, *two]) for two in [(1.001, 1.0), (-1.0, 1.0), (1.0, 1.01)]]),
     ):
         for value in values:
             with pytest.raises(CameraError, match=f"'cam'.*{field}"):
@@ -157,6 +158,17 @@ def test_cameras_on_a_circle_look_at_its_centre_and_the_face():
         np.testing.assert_allclose(camera.project(target)[0], [[31.5, 23.5]], atol=1e-9)
         assert camera.X_WC[2, 1] < 0.0, "up is up"
     np.testing.assert_allclose(face.X_WC[:3, 3], [2.6, 0.2, 1.6])
+    views = [2.0 * np.degrees(np.arctan(24.0 / camera.focal_y)) for camera in cameras.values()]
+    np.testing.assert_allclose(views, [46.0] * 8 + [22.0])
+    first, face = circle_of_cameras(1).values()
+    for camera, place, point in ((first, [-3.0, 0, 1.3], 0.95), (face, [3.0, 0, 1.6], 1.6)):
+        np.testing.assert_allclose(camera.X_WC[:3, 3], place, atol=1e-12)
+        np.testing.assert_allclose(camera.project([0, 0, point])[0], [[319.5, 239.5]])
+    assert [*circle_of_cameras(1, face_camera=False), *circle_of_cameras(0)] == ["camera_0", "face"]
+    # A camera may look steeply down, but not along the direction that is up in its picture.
+    assert look_at([0.0, 0.1, 2.0], np.zeros(3))[2, 1] < 0.0
+    with pytest.raises(CameraError, match="up"):
+        look_at([0.0, 0.0, 2.0], np.zeros(3))
     with pytest.raises(CameraError, match="at least one camera"):
         circle_of_cameras(0, face_camera=False)
     with pytest.raises(CameraError, match="radius must be positive"):

@@ -32,6 +32,7 @@ Q = dict(zip(("qx", "qy", "qz", "qw"), QUATERNION, strict=True))
 TURN = dict(zip("xyzw", QUATERNION, strict=True))
 RVEC = Rotation.from_matrix(X[:3, :3]).as_rotvec().tolist()
 SIX = [*X[:3, 3].tolist(), *Rotation.from_matrix(X[:3, :3]).as_euler("xyz").tolist()]
+ANGLES = dict(zip(("roll", "pitch", "yaw"), SIX[3:], strict=True))
 # ROS: a camera's link has x forward, y left and z up.
 X_LINK = X.copy()
 X_LINK[:3, :3] = X[:3, :3] @ np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
@@ -126,8 +127,9 @@ FORMS = {
     "view": {"world_to_camera": inverse_pose(X).tolist()},
     "wxyz": {"position": SIX[:3], "quat_wxyz": [QUATERNION[3], *QUATERNION[:3]]},
     "R, t": {"translation": SIX[:3], "rotation": X[:3, :3].tolist()},
+    "R by names": {"t": PLACE, "rotation": ANGLES},
     "rvec": {"tvec": SIX[:3], "rvec": RVEC},
-    "angles": PLACE | dict(zip(("roll", "pitch", "yaw"), SIX[3:], strict=True)),
+    "angles": PLACE | ANGLES,
     "rpy_deg": {"xyz": SIX[:3], "rpy_deg": np.degrees(SIX[3:]).tolist()},
     "rpy": {"xyz": SIX[:3], "rpy": SIX[3:]},
 }  # fmt: skip
@@ -160,6 +162,7 @@ FILES = [
     ("link.urdf", urdf(("base", "post", POST), ("post", "camera", inverse_pose(POST) @ X_LINK))),
     ("realsense.urdf", REALSENSE), ("mujoco.xml", mujoco_cameras([CAMERA])),
     ("viewer.xml", mjcf(VIEWER)),
+    ("fovy.xml", mjcf(f'name="left" {VIEWER} resolution="1280 720" fovy="58.71550708"')),
     *(
         ("pose.launch.py", f"LaunchDescription([Node(package='tf2_ros', {', '.join(words)})])")
         for words in (PUBLISHER, PUBLISHER[::-1])
@@ -187,7 +190,8 @@ def test_poses_are_read(tmp_path, scene, name, content, link):
     atol = 1e-3 if name.startswith("rounded") else 1e-9
     X_C = np.diag([1, -1, -1, 1]) if content is WRIST else X
     np.testing.assert_allclose(camera.X_WC, X_C, atol=atol)
-    assert (camera.name, camera.focal_x, camera.width) == ("left", 640.0, 1280)
+    assert (camera.name, camera.width) == ("left", 1280)
+    assert camera.focal_x == pytest.approx(640.0)
     assert (found.links, found.unplaced) == ({"left": link} if link else {}, ())
 
 
@@ -290,7 +294,10 @@ def test_what_was_assumed_is_said(tmp_path, scene):
     for content, text in (
         ({"left": SIX}, "roll, pitch, yaw [rad]"),
         ({"left": [*SIX[:3], *QUATERNION]}, "read as x, y, z, w"),
-        ({"left": X.tolist()}, ""),
+        ({"left": [*SIX[:3], 7.0, 0.0, 0.0]}, "roll, pitch, yaw [deg]"),
+        ({"left": {"t": SIX[:3], "rotation": RVEC}}, "rotation vector [rad]"),
+        *(({"left": FORMS[form]}, "") for form in ("matrix", "R by names", "wxyz", "rvec")),
+        *(({"left": {"t": SIX[:3], "rotation": turn}}, "") for turn in (TURN, Q)),
         (ECHO, "as tf2_echo BASE CAMERA prints"),
     ):
         found = load(tmp_path / "poses.yaml", content, scene)

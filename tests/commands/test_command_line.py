@@ -13,8 +13,9 @@ from types import SimpleNamespace
 import pytest
 
 from tests.cli import run_command
-from tests.jobs.scenes import TinyScene
+from tests.jobs.scenes import TinyScene, read_rows, write_scene
 
+PROGRAM = [sys.executable, "-m", "drake_pose.commands.main"]
 ROOT = Path(__file__).resolve().parents[2]
 
 
@@ -94,3 +95,47 @@ def test_check_of_a_model(tiny_scene: TinyScene, tmp_path: Path) -> None:
     result = run_command(["check", str(tmp_path / "nowhere.urdf"), "--json"])
     assert result.exit_code == 1
     assert "nowhere.urdf" in json.loads(result.stdout)["errors"][0]
+
+
+@pytest.mark.slow
+def test_ctrl_c_keeps_finished_frames_and_the_job_can_be_resumed(tmp_path: Path) -> None:
+    angles = [(20.0 * (index % 5 - 2), -20.0 * (index % 7)) for index in range(60)]
+    scene = write_scene(tmp_path / "scene", angles, ("front", "side"))
+    out = tmp_path / "out"
+    command = [*PROGRAM, "estimate", str(scene.folder), "--model", str(scene.model)]
+    command += ["--out", str(out), "--method", "paper", "--no-replay"]
+    environment = {**os.environ, "COLUMNS": "200"}
+    process = subprocess.Popen(
+        command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        # Background jobs ignore SIGINT, which children inherit.
+        env=environment, preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )  # fmt: skip
+    poses = out / "poses.csv"
+    deadline = time.monotonic() + 120.0
+    while process.poll() is None and time.monotonic() < deadline:
+        if poses.is_file() and len(poses.read_text().splitlines()) > 3:
+            break
+        time.sleep(0.01)
+    process.send_signal(signal.SIGINT)
+    stdout, stderr = process.communicate(timeout=60)
+    assert process.returncode == 1, stderr
+    assert stdout == ""
+    assert re.fullmatch(
+        rf"drake-pose: error: interrupted.*{re.escape(str(out))}.*--resume.*\n", stderr
+    )
+    finished = poses.read_text().splitlines()
+    assert 3 < len(finished) < 61
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["complete"] is False
+    assert list(summary["frames"]) == [line.split(",")[0] for line in finished[1:]]
+
+    resumed = subprocess.run(
+        [*command, "--resume", "--json"], cwd=ROOT, capture_output=True, text=True, env=environment
+    )
+    assert resumed.returncode == 0, resumed.stderr
+    assert poses.read_text().splitlines()[: len(finished)] == finished
+    assert [row["frame"] for row in read_rows(poses)] == list(scene.truth)
+    summary = json.loads(resumed.stdout)
+    assert summary["complete"] is True
+    assert summary["found_count"] == 60
+    assert not list(out.rglob("*.part"))

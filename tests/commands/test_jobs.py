@@ -6,11 +6,7 @@ import numpy as np
 import pytest
 
 from drake_pose.errors import weighted
-from drake_pose.files.settings import (
-    EstimateSettings,
-    LiveSettings,
-    MaskSettings,
-)
+from drake_pose.files.settings import EstimateSettings, LiveSettings, MaskSettings
 from tests.cli import run_command, run_json, run_to_end
 
 RECORD = SimpleNamespace(q=np.array([np.pi / 2, 0.25]))

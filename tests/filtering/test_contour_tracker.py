@@ -16,7 +16,10 @@ from drake_pose.search import (
     BeamSearch,
     BeamSearchSettings,
     ExaminationSettings,
+    JointEstimate,
     MultiStartSearch,
+    PoseEstimate,
+    PoseSet,
     View,
 )
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
@@ -80,6 +83,16 @@ def test_tracked_after_one_match_and_matched_again_after_a_jump(body, renderer):
     bare = replace(state, track=replace(state.track, measurement=None))
     for unmeasured in (TrackerState(), bare):
         assert follower.with_intervals(unmeasured, result) is result
+
+
+def test_a_track_starts_in_the_frame_of_its_pose(body, renderer):
+    """Whether the pose is searched or given, it is not predicted before."""
+    off, mask, follower = Q + 0.02, renderer.mask(Q), tracker_of(known(body, Q + 0.02))
+    begun = follower.start(follower.observation.state(off))
+    expected = follower.follow(begun, [mask], first=True).state.best
+    for start in (None, off):
+        state, _ = follower.update(TrackerState(), [View(CAMERA, mask)], start=start)
+        np.testing.assert_array_equal(state.track.state.best.covariance, expected.covariance)
 
 
 def test_frames_without_evidence_only_predict(body, renderer):
@@ -228,6 +241,20 @@ def test_hidden_parts_are_predicted_near_the_truth(body, renderer, fraction):
         if is_hidden:
             assert fraction < 1.0 or np.all(deviations > before)
         before = deviations
+
+
+@pytest.mark.parametrize(("undetermined", "is_found"), [(None, True), (0, True), (2, False)])
+def test_a_jump_is_believed_if_what_jumps_is_determined(body, renderer, undetermined, is_found):
+    search, poses = known(body), (Q, Q - np.array([0.0, 0.0, 1.7]))
+    joints = tuple(JointEstimate("", k != undetermined, 0.0, 0.0) for k in range(3))
+    follower, state = tracker_of(search), TrackerState()
+    for q in poses:
+        given = {"stopped_by": "end", "pose_set": PoseSet((), joints, 0.0, False, 1)}
+        found = PoseEstimate.of_values(search.tree, tuple(q[:, None]), 20.0, 100.0, **given)
+        search.match = lambda *_, found=found: found
+        state, pose = follower.update(state, [View(CAMERA, renderer.mask(q))])
+    assert state.matches == 2
+    assert pose.found == is_found
 
 
 def test_only_a_pose_that_explains_the_masks_replaces_measured_positions(body, renderer):

@@ -10,12 +10,7 @@ from scipy.spatial.transform import Rotation
 from drake_pose.body import bundled_model, load_model
 from drake_pose.camera.models import ParallelCamera
 from drake_pose.errors import MaskError
-from drake_pose.filtering.hand import (
-    FLEXIONS,
-    HAND_STATE,
-    MEASURED,
-    plant_positions,
-)
+from drake_pose.filtering.hand import FLEXIONS, HAND_STATE, MEASURED, plant_positions
 from drake_pose.filtering.hand_silhouette import HAND, HandSilhouette, RoughBody, match_axes
 from drake_pose.filtering.state import Belief, wrapped_difference
 from drake_pose.fit.evidence import EdgePoints, find_edge_points

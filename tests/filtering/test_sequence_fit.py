@@ -51,6 +51,7 @@ def test_all_poses_are_found_and_equal_fits_are_merged(fitted):
     deviations = np.degrees(found.deviations[:, index])
     assert (deviations > 0.0).all()
     assert np.mean(off < 2.0 * deviations) > 0.9
+    assert np.sqrt(np.mean((off / deviations) ** 2)) > 0.1
 
 
 def test_explanations_are_modes_and_their_intervals_hulls(fitted):
@@ -64,6 +65,7 @@ def test_explanations_are_modes_and_their_intervals_hulls(fitted):
         parameters = each.fitted.parameters[frame][: len(own.parameters(states[0]))]
         poses.append((*own.positions(own.state_of(parameters)), 7.0 + k))
     found = pose_set([one, other], poses, frame)
+    assert (found.mode_count, found.complete, found.tolerance) == (2, False, 0.0)
     for mode, (q, X_WB, J) in zip(found.modes, poses, strict=True):
         values = np.concatenate(own.tree.values_from_positions(q, X_WB))
         np.testing.assert_allclose(np.concatenate(mode.node_values), values, atol=1e-9)

@@ -6,11 +6,7 @@ import pytest
 from scipy.integrate import quad
 
 from drake_pose.errors import SettingsError
-from drake_pose.filtering.inequalities import (
-    Inequalities,
-    from_bounds,
-    make_inequalities,
-)
+from drake_pose.filtering.inequalities import Inequalities, from_bounds, make_inequalities
 from drake_pose.filtering.state import make_belief
 from drake_pose.filtering.truncated_normal import (
     interval_moments,

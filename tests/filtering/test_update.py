@@ -73,6 +73,17 @@ def test_hidden_measurements_are_ignored():
     assert (nothing.count, nothing.distance, nothing.log_likelihood) == (0, 0.0, 0.0)
 
 
+def test_covariances_stay_definite_for_nearly_exact_measurements():
+    sharp = FunctionObservation(("u", "v"), 1e-9, end_of, end_slope)
+    belief = Belief(np.array([0.2, 0.0, 1.0]), np.diag([1e4, 1e2, 1e4]))
+    seen = make_measurement(sharp, np.array([np.cos(0.3), np.sin(0.3)]))
+    for _ in range(20):
+        belief = update(belief, seen, 10).belief
+        np.testing.assert_array_equal(belief.covariance, belief.covariance.T)
+        assert np.linalg.eigvalsh(belief.covariance).min() > -1e-12
+        assert (belief.deviations() > 0).all()
+
+
 def test_iteration_finds_the_posterior_mode():
     prior, y = Belief(np.array([0.2, 0.0, 1.0]), np.diag([1.0, 0.1, 0.3])), np.array([0.3, 1.1])
 

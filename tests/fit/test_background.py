@@ -66,9 +66,8 @@ def test_outline_pixels_have_uncovered_neighbours(episode):
         above, below = inner[:, :-2, 1:-1], inner[:, 2:, 1:-1]
         across_u, across_v = masks & ~(left & right), masks & ~(above & below)
         assert totals[Explained.OUTLINE] == (across_u | across_v).sum()
-        u, v = (
-            np.where(a, e, -np.inf) for a, e in zip((across_u, across_v), sums.edges, strict=True)
-        )
+        edges = zip((across_u, across_v), sums.edges, strict=True)
+        u, v = (np.where(across, edge, -np.inf) for across, edge in edges)
         strongest = np.maximum(u, v)[across_u | across_v]
         np.testing.assert_allclose(totals[Explained.CONTOUR], strongest.sum(), rtol=1e-4)
         # Static nodes belong to the background and score no gain.
@@ -97,9 +96,8 @@ def test_log_odds_are_positive_on_the_body(episode):
     assert (known.unseen == ~showing.any(axis=0)).mean() > 0.99
     visible = ~known.unseen
     assert np.median(np.abs(known.colours - episode.background).max(axis=-1)[visible]) < 6.0
-    for picture, fitted_gain, mask in zip(
-        episode.pictures, backgrounds.gains, covered, strict=True
-    ):
+    frames = zip(episode.pictures, backgrounds.gains, covered, strict=True)
+    for picture, fitted_gain, mask in frames:
         foreground, tolerant = known.foreground(picture, fitted_gain, np.s_[:, :])
         assert ((foreground > 0.0) == mask)[visible].mean() > 0.97
         found = mask_of_foreground(foreground, mask, foreground)

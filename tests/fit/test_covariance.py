@@ -70,15 +70,12 @@ def test_sizes_maximise_the_posterior(scale, prior):
     def log_likelihood(t):
         V = np.einsum("k,kij->ij", np.exp(2.0 * t), residuals.effects)
         whole = V + residuals.X @ np.linalg.inv(PRIOR) @ residuals.X.T
-        log_likelihoods = np.linalg.slogdet(whole)[1] + residuals.y @ np.linalg.solve(
-            whole, residuals.y
-        )
-        return -0.5 * (log_likelihoods + t @ t / prior**2)
+        logs = np.linalg.slogdet(whole)[1] + residuals.y @ np.linalg.solve(whole, residuals.y)
+        return -0.5 * (logs + t @ t / prior**2)
 
     for step in 0.15 * np.eye(5):
-        assert log_likelihood(found) > max(
-            log_likelihood(found + step), log_likelihood(found - step)
-        )
+        beside = log_likelihood(found + step), log_likelihood(found - step)
+        assert log_likelihood(found) > max(beside)
 
 
 def test_camera_error_is_at_least_one_pixel():
@@ -140,9 +137,8 @@ def test_deformations_move_surfaces_by_a_metre(kinematics):
     X_WN = kinematics.poses(np.array([0.6, 0.7, -0.7, 0.9, 0.3]))
     for outline, X, K in zip(outlines, X_WN, surface_deformations(outlines, X_WN), strict=True):
         p_W = outline.vertices @ X[:3, :3].T + X[:3, 3]
-        moved = np.einsum(
-            "ijk,pj->kpi", K.reshape(3, 4, 12), np.pad(p_W, ((0, 0), (0, 1)), constant_values=1.0)
-        )
+        p_W = np.column_stack([p_W, np.ones(len(p_W))])
+        moved = np.einsum("ijk,pj->kpi", K.reshape(3, 4, 12), p_W)
         np.testing.assert_allclose(np.sqrt((moved**2).sum(axis=2).mean(axis=1)), 1.0, rtol=1e-6)
 
 
@@ -197,16 +193,13 @@ def test_residuals_keep_all_information_of_well_seen_parts() -> None:
     found = distances_in_masks(outlines, masks)
     assert found.X.shape == (72, 4)
     As = [symmetric(one.A) for one in masks]
-    expected = sum(
-        np.einsum("nmi,nij,nkj->mk", one.moves, A, one.moves)
-        for one, A in zip(masks, As, strict=True)
-    )
+    pairs = [*zip(masks, map(symmetric, [one.A for one in masks]), strict=True)]
+    expected = sum(np.einsum("nmi,nij,nkj->mk", one.moves, A, one.moves) for one, A in pairs)
     np.testing.assert_allclose(found.X.T @ found.X, expected, rtol=1e-6)
     np.testing.assert_allclose(found.information, expected, rtol=1e-9)
     pulled = sum(np.einsum("nmi,ni->m", one.moves, one.b) for one in masks)
-    np.testing.assert_allclose(
-        found.X.T @ found.y, pulled, rtol=1e-6, atol=1e-6 * np.abs(pulled).max()
-    )
+    scale = np.abs(pulled).max()
+    np.testing.assert_allclose(found.X.T @ found.y, pulled, rtol=1e-6, atol=1e-6 * scale)
     squares = sum(
         float(b @ np.linalg.solve(own, b))
         for one, A in zip(masks, As, strict=True)
@@ -236,9 +229,8 @@ def test_a_cameras_error_moves_the_whole_body_by_the_unit_of_errors() -> None:
     found = distances_in_masks(outlines, masks)
     for c, one in enumerate(masks):
         own = found.pictures == c
-        p_W = np.concatenate(
-            [o.vertices @ X[:3, :3].T + X[:3, 3] for o, X in zip(outlines, one.X_WN, strict=True)]
-        )
+        parts = zip(outlines, one.X_WN, strict=True)
+        p_W = np.concatenate([part.vertices @ X[:3, :3].T + X[:3, 3] for part, X in parts])
         middle = p_W.mean(axis=0)
         extent = np.sqrt(((p_W - middle) ** 2).sum(axis=1).mean())
         total = 0.0
@@ -280,10 +272,8 @@ def test_noise_repeats_where_a_part_is_seen_in_the_same_pose() -> None:
     """Relative to the camera: the first part by the first and third mask only."""
     outlines, masks = compared_clouds()
     found = distances_in_masks(outlines, masks)
-    part = np.argmax(
-        [np.abs(found.surface_derivatives[:, 12 * n : 12 * n + 12]).sum(axis=1) for n in (0, 1)],
-        axis=0,
-    )
+    parts = np.abs(found.surface_derivatives).reshape(-1, 2, 12).sum(axis=2)
+    part = np.argmax(parts, axis=1)
     by_part = found.surface_derivatives.reshape(-1, 2, 12)[np.arange(72), part]
     unit = by_part / np.linalg.norm(by_part, axis=1)[:, None]
     seen = np.where(part == 0, found.pictures % 2, found.pictures)
@@ -333,9 +323,8 @@ def test_parts_are_round_within_the_facets_of_their_meshes(tmp_path, sides, asid
     kinematics, box = TreeKinematics(tree), outline_from_mesh(tree.nodes[-1].mesh)
     outlines = (box, *[EMPTY_OUTLINE] * (len(tree.nodes) - 2), box)
     child = kinematics.value_nodes[0]
-    parts = round_parts(
-        kinematics, tuple(hull if k == child else o for k, o in enumerate(outlines))
-    )
+    surfaces = tuple(hull if k == child else one for k, one in enumerate(outlines))
+    parts = round_parts(kinematics, surfaces)
     assert [node for node, _ in parts] == [child] * is_round
     A = np.random.default_rng(0).normal(size=(2, len(outlines), 20, 12))
     A = np.swapaxes(A, 2, 3) @ A

@@ -61,13 +61,11 @@ def test_p_values_are_those_of_all_orders_of_blocks(rows, tested, number, needed
         orders = [np.array(one) for one in permutations(range(count))]
     else:
         cuts, orders = np.split(frames, 3), []
-        for shift, order, turns in product(
-            range(count), permutations(range(3)), product((1, -1), repeat=3)
-        ):
+        turned = permutations(range(3)), product((1, -1), repeat=3)
+        for shift, order, turns in product(range(count), *turned):
             rolled = np.roll(frames, shift)
-            orders.append(
-                np.concatenate([rolled[cuts[b]][:: turns[k]] for k, b in enumerate(order)])
-            )
+            parts = [rolled[cuts[b]][:: turns[k]] for k, b in enumerate(order)]
+            orders.append(np.concatenate(parts))
     own = np.trace(gains) / count
     other = [gains[frames, one].mean() for one in orders if (one != frames).any()]
     fraction = np.mean(np.array(other) >= own - 1e-12)

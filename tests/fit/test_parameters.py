@@ -74,20 +74,11 @@ def test_cameras_against_finite_differences(size):
         c, k = divmod(index, len(CAMERA_NAMES))
         above, below = (cameras.place(theta + by) for by in (step, -step))
         for p_W in np.array([[0.3, 0.1, 1.2], [-0.4, 0.2, 0.6]]):
-            measured = project(above[0][c], above[1][c], p_W) - project(
-                below[0][c], below[1][c], p_W
-            )
+            there, here = (project(X[c], lens[c], p_W) for X, lens, _ in (above, below))
             by = STEP * motions[c, k].reshape(3, 4) @ [*p_W, 1.0]
-            predicted = project(X_CW[c], kernel[c], p_W + by) - project(
-                X_CW[c], kernel[c], p_W - by
-            )
-            np.testing.assert_allclose(
-                predicted / STEP,
-                measured / STEP,
-                rtol=1e-5,
-                atol=2e-3,
-                err_msg=cameras.names[index],
-            )
+            on, back = (project(X_CW[c], kernel[c], p_W + move) for move in (by, -by))
+            near = pytest.approx((there - here) / STEP, rel=1e-5, abs=2e-3)
+            assert (on - back) / STEP == near, cameras.names[index]
 
 
 # A wrist of two joints with an invisible link between them, a mount welded on before the last

@@ -96,10 +96,8 @@ def test_sequence_prior_penalises_unusual_values_and_accelerations():
 
 def test_without_evidence_proportions_follow_the_prior(stretched):
     """Without evidence the result and its deviations are those of the prior."""
-    camera, kinematics = (
-        ParallelCamera("top", 60, 50, 100.0, 30.0, 25.0, np.eye(4)),
-        stretched.kinematics,
-    )
+    camera = ParallelCamera("top", 60, 50, 100.0, 30.0, 25.0, np.eye(4))
+    kinematics = stretched.kinematics
     free = np.count_nonzero(kinematics.lower < kinematics.upper) + 4
     usual = np.eye(free), np.full(free, 0.1), np.full(free, 4.0)
     limits = np.full(free, -np.inf), np.full(free, np.inf)
@@ -110,10 +108,8 @@ def test_without_evidence_proportions_follow_the_prior(stretched):
     )
     np.testing.assert_allclose(found.own, 0.1, atol=1e-3)
     np.testing.assert_allclose(deviations[:, deviations.any(axis=0)], 0.5, rtol=1e-3)
-    counts = [
-        len(names)
-        for names in (stretched.length_names, stretched.width_names, stretched.joint_shift_names)
-    ]
+    names = stretched.length_names, stretched.width_names, stretched.joint_shift_names
+    counts = [*map(len, names)]
     known = np.repeat([0.15**-2, 0.1**-2, 0.15**-2], counts)
     np.testing.assert_allclose(np.diag(found.equations.H[0, free:, free:]), known)
     limbs = {f"joint_shift_{kinematics.tree.nodes[i].name}" for i in stretched.movable}

@@ -2,6 +2,7 @@
 
 import json
 import math
+import time
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -10,6 +11,7 @@ import pytest
 
 from drake_pose.errors import SettingsError
 from drake_pose.papers.kameda import (
+    REAL_EXPERIMENTS,
     Causes,
     beam_experiment_search,
     causes_of_wrong_angles,
@@ -59,7 +61,7 @@ def test_camera_is_the_papers():
     ):
         pixels, depths = one.project(axes)
         np.testing.assert_allclose(pixels[1:] - pixels[0], expected, atol=1e-9)
-    assert depths[2] < depths[0]
+    assert depths[2] < depths[0] == 5.0
 
 
 def test_drawn_angles_are_multiples_of_20_degrees_or_continuous_inside_table_2(search):
@@ -82,6 +84,7 @@ def test_figures_match_drakes_label_images(result):
     """E_total, recomputed from Drake's own label images of the true and the found pose."""
     renderer = LabelRenderer(result.search.tree.model, result.cameras[0])
     for trial in result.trials:
+        assert trial.inside
         if trial.result.found:
             q_true, _ = result.search.tree.positions_from(trial.true_values)
             true, found = renderer.mask(q_true), renderer.mask(trial.result.q)
@@ -130,7 +133,14 @@ def test_beam_search_matches_every_silhouette_and_its_set_has_the_true_pose(beam
     for trial in beam_result.trials:
         values = np.concatenate(trial.true_values)
         joints = trial.result.pose_set.joints
+        assert 0.0 < trial.seconds + trial.more_seconds < time.process_time()
         assert all(joint.holds(value) for joint, value in zip(joints, values, strict=True))
+
+
+def test_the_real_forearm_points_up_and_its_hand_shows_either_side(tmp_path):
+    given = REAL_EXPERIMENTS["C"].settings(tmp_path)
+    turns = {"y": (-180.0, 180.0), "x": (-30.0, 30.0), "z": (-30.0, 30.0)}
+    assert (given.root, given.root_rotation) == ("forearm", turns)
 
 
 def at(search, **degrees):

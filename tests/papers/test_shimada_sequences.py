@@ -100,6 +100,12 @@ def test_noise_has_the_variances_given_to_the_filter():
     assert np.nanstd(seen) == pytest.approx(1.0, abs=0.02)
 
 
+def test_phases_of_the_motion_are_drawn():
+    drawn, phases = (np.random.default_rng(3) for _ in range(2))
+    states = make_sequence(40.0, "full", HandObservation(), drawn, 0.3).states
+    np.testing.assert_array_equal(states, true_states(40.0, phases.uniform(-0.6, 0.6, 6), 0.3))
+
+
 def test_lines_hide_the_knuckles_and_the_wrist():
     sequence = make_sequence(35.0, "lines", HandObservation(), np.random.default_rng(2))
     hidden = np.isnan(sequence.measurements).all(axis=0)

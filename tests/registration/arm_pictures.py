@@ -39,25 +39,21 @@ def see(
     return frames
 
 
-def damaged(
-    mask: np.ndarray, generator: np.random.Generator, radii: tuple[int, int] = (3, 9)
-) -> np.ndarray:
+def damaged(mask: np.ndarray, generator: np.random.Generator) -> np.ndarray:
     """Return a mask dilated or eroded by up to two pixels, with holes of 3 % of its area."""
     by = int(generator.integers(-2, 3))
     ball = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * abs(by) + 1,) * 2)
     change = cv2.dilate if by > 0 else cv2.erode
-    return with_holes(change(mask.astype(np.uint8), ball), generator, radii)
+    return with_holes(change(mask.astype(np.uint8), ball), generator)
 
 
-def with_holes(
-    mask: np.ndarray, generator: np.random.Generator, radii: tuple[int, int] = (3, 9)
-) -> np.ndarray:
+def with_holes(mask: np.ndarray, generator: np.random.Generator) -> np.ndarray:
     """Return a mask with round holes of 3 % of its area."""
     drawn = mask.astype(np.uint8)
     at = np.argwhere(drawn)
     while drawn.sum() > 0.97 * len(at):
         v, u = at[generator.integers(len(at))].tolist()
-        cv2.circle(drawn, (u, v), int(generator.integers(*radii)), 0, -1)
+        cv2.circle(drawn, (u, v), int(generator.integers(3, 9)), 0, -1)
     return drawn > 0
 
 

@@ -1,6 +1,7 @@
 """Motions of a camera in drawn pictures of a wall before which things move."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from drake_pose.camera.models import PinholeCamera
+from drake_pose.registration import camera_motion
 from drake_pose.registration.camera_motion import PictureMotion, find_camera_motion, find_steps
 
 WIDTH, HEIGHT, FOCAL, COUNT = 320, 240, 300.0, 40
@@ -72,6 +74,32 @@ def test_nudges_are_found_at_their_picture_with_their_angle(seed: int) -> None:
     shift = np.linalg.norm(seen[:, :2] / seen[:, 2:] - grid[:, :2], axis=1)
     assert nudge.pixels == pytest.approx(np.sqrt((shift**2).mean()), rel=0.1, abs=0.2)
     assert (motion.drift, motion.shake) == (0.0, 0.0)
+
+
+@pytest.mark.parametrize("first", [23, 26])
+def test_nudges_are_bracketed_between_compared_pictures(monkeypatch, first: int) -> None:
+    """One picture is taken in the middle of the nudge; few pictures are compared at first."""
+    monkeypatch.setattr(camera_motion, "MOTION", replace(camera_motion.MOTION, most=9))
+    R = [STILL, turn((1.0, 0.2, 0.0), 4.0), turn((1.0, 0.2, 0.0), 8.0)]
+    (nudge,) = told(lambda k: R[int(np.clip(k - first + 1, 0, 2))], 5).nudges
+    assert (nudge.before, nudge.after) == (first - 1, first + 1)
+
+
+def test_shifts_are_those_of_similar_pictures() -> None:
+    """Shifts along u and v, rotation and growth, in pictures of two thirds of the size."""
+    size, walls = (960, 720), [patched(seed, (960, 720), (5, 20, 60)) for seed in (7, 8)]
+    moves = np.array([[0.0] * 4, [4.5, -3.0, 0, 0], [0, 0, 0.01, 0], [-2, 3, -0.008, 0.015]])
+
+    def read(k: int) -> np.ndarray:
+        u, v, angle, growth = moves[k % 4]
+        view = cv2.getRotationMatrix2D((479.5, 359.5), -np.degrees(angle), 1.0 + growth)
+        view[:, 2] += u, v
+        return cv2.warpAffine(walls[k // 4], view, size).clip(0.0, 255.0).astype(np.uint8)
+
+    tracker = camera_motion.BackgroundTracker(read, 0, CAMERA.resized(*size))
+    found, radius = tracker.shifts(range(5), at_once=2), np.hypot(640, 480) / np.sqrt(12.0)
+    np.testing.assert_allclose(found[:4, :4], moves * [2 / 3, 2 / 3, radius, radius], atol=0.1)
+    assert np.isnan(found[4, :4]).all()  # Another wall.
 
 
 @pytest.mark.parametrize("seed", [0, 1])

@@ -6,12 +6,13 @@ from functools import cache
 
 import numpy as np
 import pytest
-from scipy.stats import chi2
+from scipy.stats import chi2, f, norm
 
 from drake_pose.body import ArticulatedModel
 from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import PinholeCamera
-from drake_pose.registration.diagnosis import diagnose_frames, is_half_pixel
+from drake_pose.registration import diagnosis
+from drake_pose.registration.diagnosis import Cause, Residual, diagnose_frames, is_half_pixel
 from drake_pose.registration.findings import Diagnosis, Finding
 from drake_pose.registration.per_frame_fit import (
     FrameFit,
@@ -79,6 +80,97 @@ def test_half_a_pixel_along_both_axes_is_reported_if_significant() -> None:
         (0.5, 0.8, 0.05, False), (0.5, 0.5, 0.3, False),
     ):  # fmt: skip
         assert is_half_pixel(np.array([u, v]), sd**2 * np.eye(2)) == is_half
+
+
+def cause(M: np.ndarray, name: str = "", rank: float = 1.0) -> Cause:
+    return Cause("joint", name, M, np.full(M.shape[1], 0.1), rank)
+
+
+def residual_of(x: Sequence[float], N: np.ndarray, factor: float = 1.0) -> Residual:
+    """Return the residual of errors x with a covariance of so many N, and 40 degrees of freedom.
+
+    Two outlines of lengths 2 and 3 move by |x|, a third stands still.
+    """
+    outlines = np.array([2.0, 3.0, 0.0])[:, None, None] * np.eye(len(x))
+    info = diagnosis.Information(N, N @ x, N[:, :2], outlines, np.array([2.0, 3.0, 4.0]), 2.0, 40.0)
+    return Residual(info, N, N @ x, factor * N)
+
+
+@pytest.mark.parametrize(("seed", "factor"), [(0, 1.0), (1, 1.0), (2, 3.0), (3, 3.0)])
+def test_causes_are_tested_and_estimated_as_by_least_squares(seed: int, factor: float) -> None:
+    rng = np.random.default_rng(seed)
+    A, M = 30.0 * rng.normal(size=(5, 9)), rng.normal(size=(5, 3))
+    residual = residual_of(rng.normal(0.0, 0.1, 5), A @ A.T, factor)
+    L = np.linalg.cholesky(residual.Q)
+    D, y = np.linalg.solve(L, residual.N @ M), np.linalg.solve(L, residual.r)
+    two, three = (y @ y - np.linalg.lstsq(D[:, :k], y)[1][0] for k in (2, 3))
+    own, third = cause(M[:, :2]), cause(M[:, 2:])
+    found = residual.test(own)
+    np.testing.assert_allclose(found.amount, np.linalg.lstsq(D[:, :2], y)[0], rtol=1e-4)
+    np.testing.assert_allclose(found.covariance, np.linalg.inv(D[:, :2].T @ D[:, :2]), 1e-4)
+    np.testing.assert_allclose(found.x, M[:, :2] @ found.amount)
+    assert residual.info.pixels(np.array([3.0, 0.0, 4.0, 0.0, 0.0])) == pytest.approx(5.0)
+    assert found.gain == pytest.approx(two - 4.0)
+    assert found.p_value == pytest.approx(f.sf(two / 2.0, 2, 40))
+    assert residual.p_value == pytest.approx(f.sf(y @ y / 5.0, 5, 40))
+    assert residual.explained(M) == (pytest.approx(three), 3)
+    assert residual.explained(M[:, [0, 1, 1]]) == (pytest.approx(two), 2)
+    assert residual.is_explained_by(own, third) == (f.sf(three - two, 1, 40) > 1e-4)
+    # A cause is eliminated with what it shares with the others: Schur's complement.
+    left = residual.without(cause(np.eye(5)[:, 3:]))
+    N, r, Q = left.N[:3, :3], left.r[:3], left.Q[:3, :3]
+    np.testing.assert_allclose(np.linalg.inv(N), np.linalg.inv(residual.N)[:3, :3])
+    np.testing.assert_allclose(np.linalg.solve(N, r), np.linalg.solve(residual.N, residual.r)[:3])
+    np.testing.assert_allclose(Q, factor * N)
+    np.testing.assert_allclose(left.N[3:], 0.0, atol=1e-6)
+    # Cameras' poses are as if each was measured to be right, with an error of 0.3 pixels.
+    prior = np.array([0.0, 0.0, np.linalg.norm(M[:, 2]) * np.sqrt(5.0) / 0.9])
+    K = np.linalg.pinv(np.vstack([np.sqrt(factor) * D, prior]))
+    (beside,) = residual.together([own], [third])
+    np.testing.assert_allclose(beside.amount, (K[:, :-1] @ y * np.sqrt(factor))[:2], rtol=1e-4)
+    errors = np.diag([factor] * 5 + [1.0])
+    np.testing.assert_allclose(beside.covariance, (K @ errors @ K.T)[:2, :2], rtol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("x", "found"), [((3.0, 0.99), "a"), ((3.0, 1.01), ""), ((8.0, 1.9), "a"), ((0.9, 0.8), "ab")]
+)
+def test_sufficient_causes_leave_less_than_a_pixel_or_a_quarter(x, found: str) -> None:
+    residual = residual_of(x, 1e6 * np.eye(2))
+    tests = [residual.test(cause(np.eye(2)[:, [k]], "ab"[k])) for k in (1, 0)]
+    assert [one.name for one in residual.sufficient(tests)] == [*found]
+
+
+@pytest.mark.parametrize(
+    ("x", "known", "slack", "expected"),
+    [
+        ((0.5, 0.29), 1e6, 0.0, ["da"]), ((0.5, 0.31), 1e6, 0.0, ["da", "b"]),
+        ((0.5, 0.31), 1e6, 0.52, ["dab", "b"]), ((0.5, 0.0), 1e2, 0.0, ["da"]),
+        # Bonferroni: four tests.
+        ((float(np.sqrt(f.isf(2e-4, 1, 40))) / 10.0, 0.0), 1e2, 0.0, []),
+    ],
+)  # fmt: skip
+def test_causes_are_named_if_significant_and_visible(x, known, slack, expected) -> None:
+    """The largest first; of equal ones the lowest rank; with slack those that leave little."""
+    a, b, c = np.eye(3)[:, :, None]
+    causes = [cause(a, "a"), cause(b, "b"), cause(c, "c"), cause(a, "d", 0.5)]
+    residual = residual_of([*x, 0.0], known * np.eye(3))
+    _, named, left = diagnosis.name_causes(residual, causes, slack)
+    assert ["".join(one.name for one in group) for group in named] == expected
+    assert {one.name for one in left} == {*"abcd"} - {one[0] for one in expected}
+
+
+@pytest.mark.parametrize(("known", "sd"), [(30.0, 2.0), (1.01, 1.0), (0.99, 1.0), (1e6, 1.0)])
+def test_offsets_above_the_minimum_are_detected_with_a_probability_of_95_percent(known, sd):
+    residual = residual_of([0.0, 0.0], 0.25 * known * np.eye(2), sd**2)
+    causes = [cause(2.0 * one, name) for name, one in zip("ab", np.eye(2)[:, :, None], strict=True)]
+    detected = np.sqrt(f.isf(0.5e-4, 1, 40)) + norm.ppf(0.95)
+    amount = detected * sd / np.sqrt(known) if known > 1.0 else np.inf
+    # An offset must move outlines by 0.3 pixels, too.
+    least = pytest.approx(0.1 * max(amount, 0.15), rel=1e-4)
+    assert diagnosis.minimum_detectable_offsets(residual, causes) == {"a": least, "b": least}
+    # Where next to nothing is known, nothing is significant.
+    assert (residual_of([9.0, 9.0], known * np.eye(2)).p_value == 1.0) == (known < 1.0)
 
 
 Frames = Sequence[tuple[np.ndarray, np.ndarray, Sequence[PinholeCamera]]]

@@ -1,6 +1,7 @@
 """Calibration of joint offsets and link scales."""
 
 import re
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -28,9 +29,6 @@ from tests.registration.arm_pictures import MIDDLE, PLACE, assert_close, looking
 from tests.search.arms import LINKS, arm_urdf
 
 NAMES = ("shoulder_turn", "roll_turn", "elbow_turn")
-
-
-ELBOW = {"elbow_turn": np.radians(2.0)}
 
 
 def misread(frames: list[PosedFrame], zeros: dict[str, float]) -> list[PosedFrame]:
@@ -146,10 +144,8 @@ def test_cameras_follow_held_constants_back_to_the_contours(model, body, camera)
 def test_a_measured_constant_is_combined_by_its_information() -> None:
     J = np.random.default_rng(3).normal(size=(4, 4)) * [0.01, 0.01, 0.01, 0.002]
     C, e, names = J @ J.T, np.eye(4)[2], ("eye.turn_y", "eye.turn_x", "first", "second")
-    fit, seen = (
-        SimpleNamespace(names=names),
-        SharedValues(np.array([1, -2, 5, 3]) / 100, np.zeros(0)),
-    )
+    fit = SimpleNamespace(names=names)
+    seen = SharedValues(np.array([1, -2, 5, 3]) / 100, np.zeros(0))
     for deviation in (0.001, 0.03):
         measured = {"first": (0.02, deviation), "gone": (9.0, 1.0)}
         found, after = with_measured(fit, seen, C, measured)
@@ -169,7 +165,29 @@ def test_lost_fits_and_few_frames_are_refused() -> None:
         require_fit_kept(0.74, 0.8)
     for count, joints, links in ((2, 1, 0), (2, 1, 1), (5, 3, 2)):
         require_frame_count(count, joints, links)
-        with pytest.raises(
-            RegistrationError, match=f"{joints} joints .* {links} links .* {count - 1}"
-        ):
+        said = f"{joints} joints .* {links} links .* {count - 1}"
+        with pytest.raises(RegistrationError, match=said):
             require_frame_count(count - 1, joints, links)
+
+
+@pytest.mark.slow
+def test_cameras_share_offsets_and_link_scales(model, body):
+    """Two cameras together estimate a robot's offset better than each alone."""
+    places = (np.array([1.6, 0.4, 0.5]), np.array([0.3, -1.6, 0.7]))
+    registered, frames, alone = [], [], []
+    elbow = {"elbow_turn": np.radians(2.0)}
+    for seed, place in enumerate(places):
+        camera = replace(looking_at(place, MIDDLE, 0.1), name=f"eye {seed}")
+        frames.append(misread(see(model, body, camera, 4, seed), elbow))
+        registered.append(CameraSearch(body).refine(camera, frames[-1]))
+        alone.append(calibrate_joints(body, registered[-1:], frames[-1:], ["elbow_turn"]))
+    found = calibrate_joints(body, registered, frames, ["elbow_turn"], links=["shoulder", "elbow"])
+    (zero,) = found.offsets
+    assert zero.low < np.radians(2.0) < zero.high
+    assert zero.significant
+    assert zero.deviation < max(one.offsets[0].deviation for one in alone)
+    for one in found.link_scales:
+        assert one.low < 0.0 < one.high
+        assert not one.significant
+    for camera, place in zip(found.cameras, places, strict=True):
+        assert_close(camera.X_WC, looking_at(place, MIDDLE, 0.1).X_WC, 4e-3, 0.15)

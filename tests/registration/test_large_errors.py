@@ -87,9 +87,8 @@ def test_misfit_counts_the_pixels_of_scaled_pictures_that_differ(body, frames) -
     expected = np.zeros(len(frames))
     for k, frame in enumerate(wrong):
         for camera in CAMERAS:
-            small = cv2.resize(
-                frame.masks[camera.name].astype(float), side, interpolation=cv2.INTER_AREA
-            )
+            mask = frame.masks[camera.name].astype(float)
+            small = cv2.resize(mask, side, interpolation=cv2.INTER_AREA)
             X_CN = camera.X_CW @ body.kinematics.poses(frame.values)
             drawn = draw_mask(body.coarse, X_CN, camera.resized(*side))
             expected[k] += np.count_nonzero(drawn ^ (small > 0.5))
@@ -121,9 +120,8 @@ def test_offsets_and_signs_are_found(body, frames, j, sign, by, kind) -> None:
     assert (found.kind, found.name, found.cameras) == (kind, NAMES[j], CAMERAS)
     assert found.amount == pytest.approx(by, abs=0.012 if j == 1 else np.radians(1.2))
     again = np.array([found.apply(one).values for one in wrong])
-    np.testing.assert_allclose(
-        again[:, j], sign * np.array([f.values[j] for f in wrong]) + found.amount
-    )
+    read = np.array([one.values[j] for one in wrong])
+    np.testing.assert_allclose(again[:, j], sign * read + found.amount)
     others = np.delete(again, j, axis=1)
     np.testing.assert_array_equal(others, np.delete([f.values for f in frames], j, axis=1))
 
@@ -195,10 +193,8 @@ def test_other_focal_lengths_explain_pictures_unless_near(body, frames) -> None:
         by = 1.0 / factor - 1.0
         focal = Correction("focal", "focal lengths", CAMERAS, unchanged, by)
         assert search.find([focal], (), max_remaining=1.0) is (None if near else focal)
-        assert (
-            search.misfits(focal).sum()
-            < search.misfits(Correction("", "", zoomed, unchanged)).sum()
-        )
+        nothing = Correction("", "", zoomed, unchanged)
+        assert search.misfits(focal).sum() < search.misfits(nothing).sum()
 
 
 def test_corrections_are_applied_in_order(body, frames) -> None:

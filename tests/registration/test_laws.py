@@ -68,9 +68,8 @@ def test_priors_add_their_information_to_the_normal_equations(posed: PosedFrames
     fit, free = with_zero(posed), with_zero(posed)
     free.problem.information = np.zeros_like(free.problem.information)
     shared = np.array([0.01, 0.0, -0.01, 0.002, 0.003, 0.0, 0.04, -0.03])
-    with_prior, without = (
-        one.equations(SharedValues(shared, np.zeros(2)), STEP) for one in (fit, free)
-    )
+    values = SharedValues(shared, np.zeros(2))
+    with_prior, without = (one.equations(values, STEP) for one in (fit, free))
     known = np.array([0.0] * 6 + [SHARED.focal_deviation**-2, SHARED.constant_deviation**-2])
     H, g = with_prior.H - without.H, with_prior.g - without.g
     np.testing.assert_allclose(H.sum(axis=0)[1:, 1:], np.diag(known), atol=1e-6)
@@ -171,9 +170,14 @@ def test_bound_gradient_matches_cost_differences(posed: PosedFrames) -> None:
 
 def test_rotation_spread_about_one_axis_or_two(make_target):
     """Rotations about known axes; frames with too little rotation are refused."""
-    R = Rotation.from_rotvec([[0.0, 0.0, 0.0], [0.0, 0.0, 0.3], [0.3, 0.0, 0.0]]).as_matrix()
-    np.testing.assert_allclose(rotation_spread(R[:2]), [0.3, 0.0, 0.0], atol=1e-9)
-    assert rotation_spread(R)[1] > 0.1
+    small = 1e-4 * np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
+    for vectors, expected in (
+        (np.outer([0.0, 0.3, 0.9], [0.6, 0.0, 0.8]), [np.sqrt(0.42), 0.0, 0.0]),
+        (small, [1e-4, 1e-4 / np.sqrt(3.0), 0.0]),
+        (small[:1], [0.0, 0.0, 0.0]),
+    ):
+        found = rotation_spread(Rotation.from_rotvec(vectors).as_matrix())
+        np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-7)
     thing = make_target("box")
     values = np.zeros((3, len(thing.body(np.eye(4)).kinematics.names)))
     turning = values + np.random.default_rng(1).uniform(-0.8, 0.8, values.shape)
@@ -288,9 +292,8 @@ def test_motions_of_a_round_target_differ_by_the_direction_of_its_axis() -> None
 
 def test_rotation_of_a_round_target_about_its_axis_is_uncertain(make_target):
     X_WT = looking_at(PLACE, MIDDLE, 0.4).X_WC
-    box, can = (
-        make_target(name).pose_covariance(X_WT, 1e-6 * np.eye(6)) for name in ("box", "can")
-    )
+    things = make_target("box"), make_target("can")
+    box, can = (thing.pose_covariance(X_WT, 1e-6 * np.eye(6)) for thing in things)
     axis = X_WT[:3, 2]
     assert axis @ box[:3, :3] @ axis == pytest.approx(1e-6)
     assert axis @ can[:3, :3] @ axis == pytest.approx(np.pi**2 / 3.0, rel=1e-3)
@@ -336,9 +339,8 @@ def test_hand_eye_fit_finds_camera_and_target(make_target):
     off = true.copy()
     off[0] = X_LC @ motion(np.array([0.02, -0.02, 0.02, 0.01, -0.01, 0.01]))
     off[1] = thing.moved(true[1], np.array([0.01, 0.01, -0.01, 0.02, 0.02, -0.02]))
-    wrong, right = (
-        search.misfits(camera, [[one]], np.array([true, off])) for one in (other, frames[0])
-    )
+    poses = np.array([true, off])
+    wrong, right = (search.misfits(camera, [[one]], poses) for one in (other, frames[0]))
     assert right[0] < 0.05 < right[1] < wrong[0]
     assert search.misfits(camera, [[other, frames[0]], [frames[1]]], true[None], 100.0)[0] < 0.05
     # Errors are clipped at one.
@@ -431,6 +433,23 @@ def test_hand_eye_starts_solve_AX_XB_exactly() -> None:
     np.testing.assert_allclose(best[0], X_LC, atol=1e-9)
     # The target's pose is known up to its symmetry.
     assert min(np.abs(best[1] - X_WT @ turn).max() for turn in (np.eye(4), half)) < 1e-9
+    # The three frames that turn most about a second axis come first; the fourth one's is wrong.
+    threes = [[*range(k), *range(k + 1, 4)] for k in range(4)]
+    wrong = int(np.argmax([rotation_spread(X_WL[three, :3, :3])[1] for three in threes]))
+    seen = [X[None] for X in true]
+    seen[wrong] = random_poses(rng, 1)
+    for found in (hand_eye_starts(X_WL, seen, np.eye(4)[None], triples=k) for k in (1, 4)):
+        np.testing.assert_allclose(found[0], [X_LC, X_WT], atol=1e-9)
+
+
+def test_hand_eye_starts_about_one_axis_hold_the_position_along_it_at_zero() -> None:
+    rng, about = np.random.default_rng(2), np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+    X_WL = random_poses(rng, 1) @ motion(np.outer([0.0, 0.4, 1.1, 1.7], about))
+    X_LC, X_WT = random_poses(rng, 2)
+    seen = np.linalg.inv(X_WL @ X_LC) @ X_WT
+    for found, target in hand_eye_starts(X_WL, [X[None] for X in seen], np.eye(4)[None]):
+        np.testing.assert_allclose(X_WL @ found @ seen, [target] * 4, atol=1e-7)
+        assert found[2, 3] == pytest.approx(0.0, abs=1e-7)
 
 
 def test_bundle_adjustment_corrects_camera_and_positions(body: RegistrationBody) -> None:
@@ -474,10 +493,7 @@ def per_frame(body, posed) -> tuple[PerFrameFit, list[MultiViewFrame]]:
 
 def test_masks_of_wrong_size_and_empty_masks_are_refused(body, posed, per_frame):
     (fit, (frame, *_)), surfaces = per_frame, (body.medium, body.full)
-    for mask, said in (
-        (np.zeros((480, 640), bool), "no mask"),
-        (np.ones((9, 9), bool), "640 x 480"),
-    ):
+    for mask, said in ((np.zeros((480, 640)) > 0, "no mask"), (np.ones((9, 9)) > 0, "640 x 480")):
         one = replace(posed.frames[0], name="0007", mask=mask)
         with pytest.raises(MaskError, match="camera 'eye', frame '0007'"):
             PosedFrames(body.kinematics, body.medium, posed.camera, [one])
@@ -508,6 +524,8 @@ def test_boundary_bias_matches_dilation_and_erosion(per_frame, wider: int) -> No
 def test_corrections_of_the_base_and_of_lenses_match_projections(per_frame) -> None:
     """The base turns by 20 degrees; focal length and principal point change, too."""
     (fit, _), points = per_frame, np.random.default_rng(3).uniform(-0.1, 0.1, (9, 3))
+    of_cameras = ([0.05] * 7 + [0.05 * fit.size] * 2) * 2
+    assert fit.deviations.tolist() == [0.1] * 5 + of_cameras + [0.05] * len(fit.links)
     turn, shift, lens = np.array([0.2, -0.2, 0.2]), [0.02, 0.01, -0.03], [0.1, 3.0, -2.0]
     at, rows = fit.base_jacobian() @ [*turn, *shift], fit.rows(CAMERA_NAMES[6:], ["eye"])
     at[rows] = lens / fit.deviations[rows]

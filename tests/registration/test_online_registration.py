@@ -60,10 +60,8 @@ class ScriptedSearch:
         return self._at(near, frames, 0)
 
     def _at(self, place: str, frames: Sequence[PosedFrame], others: int) -> RegisteredCamera:
-        agreeing = [
-            frame.name == place or {frame.name, place} == {"here", "a little off"}
-            for frame in frames
-        ]
+        near = {place}, {"here", "a little off"}
+        agreeing = [{frame.name, place} in near for frame in frames]
         misfits = [
             FrameMisfit(frame.name, 0.02, 0.98, 0.97 if is_inlier else 0.2, is_inlier)
             for frame, is_inlier in zip(frames, agreeing, strict=True)
@@ -89,9 +87,8 @@ def search() -> ScriptedSearch:
 
 @pytest.fixture
 def online(body: RegistrationBody, search: ScriptedSearch) -> OnlineRegistration:
-    return OnlineRegistration(
-        body, camera_at(0.0), OnlineSettings(most_frames=6, newest=3, least_frames=4), search
-    )
+    settings = OnlineSettings(most_frames=6, newest=3, least_frames=4)
+    return OnlineRegistration(body, camera_at(0.0), settings, search)
 
 
 def frame(place: str, turn: float) -> PosedFrame:
@@ -112,9 +109,8 @@ def follow(
 
 def registered_at(state: OnlineState, x: float) -> bool:
     """Return whether the registered camera is at ``camera_at(x)``."""
-    return state.registered is not None and np.allclose(
-        state.registered.camera.X_WC, camera_at(x).X_WC
-    )
+    known = state.registered
+    return known is not None and np.allclose(known.camera.X_WC, camera_at(x).X_WC)
 
 
 def names(state: OnlineState) -> set[str]:

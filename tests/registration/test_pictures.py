@@ -8,6 +8,7 @@ import pytest
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
+from drake_pose.camera.picture_files import Video
 from drake_pose.errors import RegistrationError
 from drake_pose.fit.background import COLOURS, KnownBackground, foreground_picture
 from drake_pose.fit.explain_kernel import Explained
@@ -46,6 +47,7 @@ from drake_pose.registration.recording import (
     stuck_pictures,
 )
 from tests.benchmarks.registration import pose_error
+from tests.camera.recordings import write_pictures
 from tests.registration.arm_pictures import assert_close
 from tests.registration.episodes import LATE, PaintedEpisode
 
@@ -281,10 +283,8 @@ def test_time_offset_and_camera_are_fitted_within_their_deviations(registered, e
     assert registered.focal_deviation == 0.0
     # A registration has the logged values, without the offsets that its frames were fitted with.
     offsets = np.arange(5.0)
-    logged = replace(
-        registered.recording,
-        values_at=lambda offset: registered.recording.values_at(offset) - offsets,
-    )
+    values_at = registered.recording.values_at
+    logged = replace(registered.recording, values_at=lambda offset: values_at(offset) - offsets)
     start = PictureStart.of(registered)._replace(evidence=None)
     again = accept_fit(episode.body, registered.fit, logged, start, offsets, 0.0)
     np.testing.assert_allclose([one.values for one in again.frames], values - offsets)
@@ -393,9 +393,8 @@ def test_camera_is_found_without_initial_guess_within_its_deviations(episode, re
     deviations = np.sqrt(np.diag(found.found.covariance))
     assert (np.abs(error) < 3.0 * deviations).all()
     assert np.linalg.norm(error[3:]) < 0.012
-    assert found.time_offset.value == pytest.approx(
-        LATE, abs=4.0 * found.time_offset.deviation + 1e-3
-    )
+    clock = found.time_offset
+    assert clock.value == pytest.approx(LATE, abs=4.0 * clock.deviation + 1e-3)
     assert found.time_offset.deviation < 0.02
     # The best scanned offset is next to the fitted one.
     offsets, scores = found.time_offset.scores.T
@@ -471,3 +470,53 @@ def test_pictures_are_segmented_up_to_a_distance_from_the_body() -> None:
     known_rows, known_columns = np.nonzero((frame.foreground != unknown).any(axis=2))
     for places in (known_rows, known_columns):
         assert (places.min(), places.max()) == (20, 59)
+
+
+@pytest.mark.slow
+def test_camera_is_found_in_compressed_pictures(episode, recording, tmp_path):
+    path = tmp_path / "camera.mp4"
+    write_pictures(path, episode.pictures, episode.times, "libx264", crf="33")
+    found = register_pictures(episode.body, episode.camera, recording(read=Video(path).read))
+    error = pose_error(found.found.camera.X_WC, episode.camera.X_WC)
+    assert (np.abs(error) < 3.0 * np.sqrt(np.diag(found.found.covariance))).all()
+    assert np.linalg.norm(error[3:]) < 0.025
+
+
+@pytest.mark.slow
+def test_drift_is_corrected(episode, recording):
+    faster = recording(values_at=lambda offset: episode.values_at(0.97 * episode.times + offset))
+    found = register_pictures(episode.body, episode.camera, faster)
+    # Pictures show later poses, increasingly so.
+    assert found.time_offset.drift == pytest.approx(0.03 / 0.97, abs=0.003)
+    assert found.time_offset.drift_deviation < 0.003
+    assert np.linalg.norm(pose_error(found.found.camera.X_WC, episode.camera.X_WC)[3:]) < 0.012
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("said", ["its pictures are mirrored", "no pose explains its pictures"])
+def test_mirrored_pictures_and_joints_of_another_episode_are_refused(episode, recording, said):
+    if "mirrored" in said:
+        wrong = recording(read=lambda k: np.ascontiguousarray(episode.pictures[k][:, ::-1]))
+    else:
+        wrong = recording(values_at=lambda offset: -0.7 * episode.values_at(2.0 * episode.times))
+    with pytest.raises(RegistrationError, match=said):
+        register_pictures(episode.body, episode.camera, wrong)
+
+
+@pytest.mark.slow
+def test_unknown_lens_of_squeezed_pictures_is_found(episode, recording):
+    """Pictures of 4:3 are squeezed to squares, and no focal length is known."""
+    camera, side = episode.camera, 120
+
+    def read(k: int) -> np.ndarray:
+        return cv2.resize(episode.pictures[k], (side, side), interpolation=cv2.INTER_AREA)
+
+    guess = replace(camera.resized(side, side), focal_x=0.65 * side, focal_y=0.65 * side)
+    found = register_pictures(
+        episode.body, guess, recording(read=read), focal=0.5, guessed_lens=True
+    ).found
+    true = camera.focal_x * side / camera.width
+    assert found.camera.focal_x == pytest.approx(true, rel=0.05)
+    assert found.camera.focal_y == pytest.approx(camera.focal_y * side / camera.height, rel=0.05)
+    error = pose_error(found.camera.X_WC, camera.X_WC)
+    assert np.linalg.norm(error[3:]) < 3.0 * found.translation_sd

@@ -11,7 +11,7 @@ from tests.search.bodies import box_link, front_camera, joint, load_body
 from tests.search.naive_search import NaiveSearch
 
 
-@pytest.mark.parametrize(("views", "K", "r"), [(1, 1, 12.0), (1, 5, 30.0), (2, 3, 20.0)])
+@pytest.mark.parametrize(("views", "K", "r"), [(1, 1, 12.0), (1, 8, 100.0), (2, 3, 20.0)])
 def test_search_equals_a_naive_implementation_of_the_paper(maker, views, K, r):
     """Pose, J, first J and runs of step 3, from masks of grid poses and of others."""
     settings = PaperSearchSettings(outside_limit=r, candidate_limit=K, **maker.grid)

@@ -10,14 +10,7 @@ from drake_pose.search.refinement import RefinementProblem
 from drake_pose.silhouette.outline import TreeSurfaces
 from drake_pose.silhouette.scoring import draw_mask
 from drake_pose.workers import use_workers
-from tests.search.arms import (
-    arm_cameras,
-    damaged_views,
-    draw_pose,
-    draw_view,
-    is_held,
-    split,
-)
+from tests.search.arms import arm_cameras, damaged_views, draw_pose, draw_view, is_held, split
 from tests.search.bodies import front_camera, swinging_chain
 
 

@@ -167,11 +167,15 @@ def test_results_depend_neither_on_workers_nor_on_the_root(body, seen):
 
 def test_a_root_may_lie_beyond_the_image_border(body):
     camera = front_camera(160)
-    mask = picture(body, camera, (0.0, 0.1, 0.8))
-    assert mask[0].any()
     search = RootPlacementSearch(body.pose_tree(), SETTINGS)
-    (layer,) = find_root_places(search.body, [View(camera, mask)], False, None)
-    assert np.linalg.norm(layer.positions[:, 1:] - [0.1, 0.8], axis=1).min() < 0.04
+    for place in ((0.1, 0.8), (0.1, -0.8), (0.8, 0.1), (-0.8, 0.1)):
+        mask = picture(body, camera, (0.0, *place))
+        (layer,) = find_root_places(search.body, [View(camera, mask)], False, None)
+        positions = layer.positions[:, 1:]
+        assert np.linalg.norm(positions - place, axis=1).min() < 0.04
+        # The picture ends at 0.8 m; only the side that the silhouette touches is left.
+        left = np.abs(positions).max(axis=0) > 0.81
+        assert left.tolist() == [abs(one) == 0.8 for one in place]
 
 
 def test_a_zero_time_limit_returns_a_placement(body, seen):

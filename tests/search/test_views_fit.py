@@ -7,12 +7,7 @@ from scipy.stats import t as student
 
 from drake_pose.body import load_model
 from drake_pose.body.tree_kinematics import TreeKinematics
-from drake_pose.fit.covariance import (
-    Distances,
-    estimate_sizes,
-    values_covariance,
-    vuong_statistic,
-)
+from drake_pose.fit.covariance import Distances, estimate_sizes, values_covariance, vuong_statistic
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.surfaces import simplify_surfaces
 from drake_pose.search import View, ViewsFit, views_fit

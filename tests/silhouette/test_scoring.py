@@ -122,6 +122,9 @@ def test_a_body_that_a_camera_cannot_show_is_refused():
     X_CN = np.tile(np.eye(4), (3, 1, 1))
     X_CN[:, 2, 3] = 3.0, -9e9, 0.5
     require_visible(surfaces, X_CN, PINHOLE)
+    X_CN[0, :3, 3] = 0.01, -0.03, 0.02
+    with pytest.raises(CameraError, match="'eye' is inside"):
+        require_visible([outline_from_mesh(box(0.1))], X_CN[:1], PINHOLE)
 
 
 BALL = trimesh.creation.icosphere(3)

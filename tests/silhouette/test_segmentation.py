@@ -43,10 +43,11 @@ def test_person_region_matches_its_definition(seed):
         picture[patch] = np.where(mean[patch] < 128, 255, 0)
         deviation[patch] = 3.0
     if seed % 7 == 0:
-        # A ring of 24 pixels, whose hole is no patch.
+        # A ring of 24 pixels, whose hole is no patch, and a patch in it that is too small.
         deviation[:] = 3.0
         picture[4:28, 4:28] = np.where(mean[4:28, 4:28] < 128, 255, 0)
         picture[10:22, 10:22] = mean[10:22, 10:22]
+        picture[14:17, 14:17] = np.where(mean[14:17, 14:17] < 128, 255, 0)
     off = np.abs(picture.astype(int) - mean) > np.floor(5.0 * deviation)[:, :, None]
     square = np.ones((3, 3), np.uint8)
     expected = off.any(axis=2).astype(np.uint8)
@@ -122,6 +123,15 @@ def test_regions_have_a_fair_size_and_differ():
         for k, one in enumerate(found):
             assert all(intersection_over_union(one, other) < 0.9 for other in found[:k])
     assert find_regions(np.full((60, 80, 3), 100, np.uint8), 12) == []
+
+
+def test_the_regions_with_the_strongest_outlines_come_first():
+    picture = np.full((120, 160, 3), 60, np.uint8)
+    for left, level in ((20, 130), (90, 200)):
+        picture[30:70, left : left + 40] = level
+    for count in (1, 2):
+        found = find_regions(picture, count)
+        assert [int(np.median(picture[one])) for one in found] == [200, 130][:count]
 
 
 def drawn(at_border, width):

@@ -96,3 +96,5 @@ def test_a_simulated_camera_sees_the_skin(tmp_path):
     assert set(np.unique(seen[seen < 32000])) <= set(np.unique(reference))
     assert Bench(matcher, matcher.GetMyContextFromRoot(context))["E_total"] < 0.01
     assert all(meshcat.HasPath(f"{name}/skin/hand") for name in ("true", "estimated"))
+    opacity = meshcat._GetPackedProperty("estimated", "modulated_opacity")
+    assert np.frombuffer(opacity[-8:], ">f8") == 0.5

@@ -1,5 +1,7 @@
 """Simulated cameras compared with Drake's sensors, and the player of recorded masks."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -64,14 +66,14 @@ def test_a_rigs_masks_equal_the_label_renderers(person):
         build_camera_rig(person, {"flat": parallel})
 
 
-def test_the_mask_player_plays_frame_by_frame(tiny_scene):
+def test_the_mask_player_plays_frame_by_frame(tiny_scene, tmp_path):
     """The first and the last frame also before and after; what is not given is NaN or empty."""
-    scene = load_scene(tiny_scene.folder)
+    scene = replace(load_scene(tiny_scene.folder), frame_rate_hz=30.0)
     (camera,), frames = scene.cameras.values(), scene.frames
     values = {frames[1]: np.arange(3.0)}
     system = MaskPlayer(scene, [camera], positions=values, root_positions=values)
-    run, period = Bench(system), 1.0 / (scene.frame_rate_hz or 1.0)
-    assert system.period == period
+    run, period = Bench(system), system.period
+    assert period == 1 / 30
     assert not system.color_cameras
     for time, frame in ((-1.0, 0), (0.0, 0), (0.9, 0), (1.0, 1), (1.9999, 1), (2.0, 2), (9.0, 2)):
         run.context.SetTime(time * period)
@@ -89,6 +91,14 @@ def test_the_mask_player_plays_frame_by_frame(tiny_scene):
     assert (both["label_image_other"].data == EMPTY).all()
     seen = both[f"label_image_{camera.name}"].data[..., 0] == 1
     np.testing.assert_array_equal(seen, scene.read(camera.name, frames[1]))
+    # Pictures are blue, and only of one frame.
+    cv2.imwrite(str(tmp_path / "1.png"), np.full((camera.height, camera.width, 3), (200, 0, 0)))
+    filmed = replace(scene, images={(camera.name, frames[1]): tmp_path / "1.png"})
+    run = Bench(MaskPlayer(filmed, [camera, other]))
+    assert run.system.color_cameras == (camera.name,)
+    assert not run[f"color_image_{camera.name}"].size()
+    run.context.SetTime(period)
+    assert (run[f"color_image_{camera.name}"].data == (0, 0, 200, 255)).all()
 
 
 def camera_at(eye, target) -> PinholeCamera:

@@ -9,14 +9,7 @@ import numpy as np
 import pytest
 
 from drake_pose.body import load_model, model_warnings
-from tests.urdf.surfaces import (
-    URDF,
-    Silhouettes,
-    assert_closed,
-    committed,
-    read_obj,
-    written_again,
-)
+from tests.urdf.surfaces import URDF, Silhouettes, assert_closed, committed, read_obj, written_again
 from tests.written_files import assert_same_files
 
 BODIES = ("woman", "man")

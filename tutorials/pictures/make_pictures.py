@@ -78,12 +78,7 @@ def woman_picture() -> np.ndarray:
     silhouette = np.repeat(np.where(mask, 255, 24).astype(np.uint8)[:, :, None], 3, axis=2)
     overlay = paint_agreement(mask, segments >= 0, segments)
     return np.hstack(
-        [
-            colour_image(woman, camera, q),
-            silhouette,
-            colour_image(woman, camera, result.q),
-            overlay,
-        ]
+        [colour_image(woman, camera, q), silhouette, colour_image(woman, camera, result.q), overlay]
     )
 
 

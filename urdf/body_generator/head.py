@@ -203,11 +203,7 @@ def head(m: Measures, build: Build) -> list[Shell]:
         [[1, 0, 0], [0, np.cos(lean), np.sin(lean)], [0, -np.sin(lean), np.cos(lean)]]
     )
     ear = ear.transformed(backwards @ outwards).moved(
-        (
-            0.5 * m.headbreadth - 0.006 * s,
-            m.stature - m.tragiontopofhead + 0.004 * s,
-            -0.004 * s,
-        )
+        (0.5 * m.headbreadth - 0.006 * s, m.stature - m.tragiontopofhead + 0.004 * s, -0.004 * s)
     )
     shells += [ear, ear.mirrored()]
     lip_y = chin + 0.30 * face

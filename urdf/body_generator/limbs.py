@@ -55,9 +55,7 @@ def upper_arm(m: Measures, build: Build) -> list[Shell]:
         _limb_section(end, 1.0, elbow, (1.06, 1.06, 0.96, 0.96)),
     ]
     deltoid = EllipsoidBump(
-        (0.32 * out, 0.20 * end[1], -0.001 * s),
-        (0.68 * out, 0.085 * s, 0.044 * s),
-        0.03 * s,
+        (0.32 * out, 0.20 * end[1], -0.001 * s), (0.68 * out, 0.085 * s, 0.044 * s), 0.03 * s
     )
     biceps = SwellingBump(
         (0.5 * end[0], 0.58 * end[1], 0.05 * s),

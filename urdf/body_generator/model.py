@@ -18,28 +18,12 @@ Limits = tuple[tuple[str, float, float], ...]
 SEGMENTS: dict[str, tuple[str, str, Limits]] = {
     "head": ("", "head", (("y", -90, 90), ("z", -30, 30), ("x", -30, 30))),
     "chest": ("head", "chest", (("y", -60, 60), ("z", -30, 30), ("x", -30, 30))),
-    "right_upper_arm": (
-        "chest",
-        "upper_arm",
-        (("x", -180, 20), ("z", -90, 20), ("y", -20, 90)),
-    ),
+    "right_upper_arm": ("chest", "upper_arm", (("x", -180, 20), ("z", -90, 20), ("y", -20, 90))),
     "right_forearm": ("right_upper_arm", "forearm", (("x", -160, 0),)),
-    "right_hand": (
-        "right_forearm",
-        "hand",
-        (("y", -90, 90), ("z", -45, 40), ("x", -10, 30)),
-    ),
-    "left_upper_arm": (
-        "chest",
-        "upper_arm",
-        (("x", -180, 20), ("z", -20, 90), ("y", -90, 20)),
-    ),
+    "right_hand": ("right_forearm", "hand", (("y", -90, 90), ("z", -45, 40), ("x", -10, 30))),
+    "left_upper_arm": ("chest", "upper_arm", (("x", -180, 20), ("z", -20, 90), ("y", -90, 20))),
     "left_forearm": ("left_upper_arm", "forearm", (("x", -160, 0),)),
-    "left_hand": (
-        "left_forearm",
-        "hand",
-        (("y", -90, 90), ("z", -40, 45), ("x", -10, 30)),
-    ),
+    "left_hand": ("left_forearm", "hand", (("y", -90, 90), ("z", -40, 45), ("x", -10, 30))),
     "waist": ("chest", "waist", (("y", -50, 50), ("z", -30, 30), ("x", -20, 20))),
     "right_thigh": ("waist", "thigh", (("y", -50, 20), ("z", -40, 0), ("x", -100, 10))),
     "right_shin": ("right_thigh", "shin", (("x", 0, 120),)),

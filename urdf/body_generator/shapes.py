@@ -135,11 +135,7 @@ class Section:
         length = float(np.linalg.norm(np.diff(ring, axis=0), axis=1).sum())
         s = girth / length
         return replace(
-            self,
-            left=self.left * s,
-            right=self.right * s,
-            front=self.front * s,
-            back=self.back * s,
+            self, left=self.left * s, right=self.right * s, front=self.front * s, back=self.back * s
         )
 
 
@@ -199,16 +195,14 @@ class Loft:
         else:
             middle = np.array(sorted({low, high, *self.rings}))
         turn = 0.5 * np.pi * np.arange(1, self.cap_rings + 1) / (self.cap_rings + 0.6)
-        heights = np.concatenate(
-            [np.full(turn.size, low), middle, np.full(turn.size, high)],
-        )
+        heights = np.concatenate([np.full(turn.size, low), middle, np.full(turn.size, high)])
         shrink = np.concatenate([np.cos(turn)[::-1], np.ones(middle.size), np.cos(turn)])
         drop = np.concatenate(
             [
                 -self.low_cap * np.sin(turn)[::-1],
                 np.zeros(middle.size),
                 self.high_cap * np.sin(turn),
-            ],
+            ]
         )
         return heights, shrink, drop
 
@@ -243,11 +237,7 @@ def smooth_maximum(a: np.ndarray, b: np.ndarray, width: float) -> np.ndarray:
 
 
 def ellipsoid(
-    centre: ArrayLike,
-    radii: ArrayLike,
-    material: str,
-    around: int = 8,
-    rings: int = 5,
+    centre: ArrayLike, radii: ArrayLike, material: str, around: int = 8, rings: int = 5
 ) -> Shell:
     """Return an ellipsoid with poles along y."""
     tilt = np.pi * (np.arange(rings) + 1.0) / (rings + 1.0)

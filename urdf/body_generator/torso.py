@@ -94,11 +94,7 @@ def _chest_sections(m: Measures, build: Build) -> list[Section]:
             2.5,
         ),
         _section(
-            m.axillaheight + 0.035 * s,
-            0.45 * ribs + 0.52 * shoulder,
-            0.056 * s,
-            -0.116 * s,
-            2.4,
+            m.axillaheight + 0.035 * s, 0.45 * ribs + 0.52 * shoulder, 0.056 * s, -0.116 * s, 2.4
         ),
         _section(top - 0.021 * s, 0.985 * shoulder, 0.040 * s, -0.098 * s, 2.3),
         _section(top - 0.004 * s, 0.92 * shoulder, 0.037 * s, -0.090 * s, 2.1),

@@ -147,10 +147,7 @@ def proximal(name: str, m: HandMeasures) -> Shell:
         y = share * web
         radius = float(np.interp(y, [0.0, 0.6 * length, length], [base, 0.97 * half[0], end]))
         sections.append(_round(y, radius, reach * thumbwards, reach * outwards))
-    sections += [
-        _round(web + 0.11 * length, 0.98 * half[0]),
-        _round(length, end),
-    ]
+    sections += [_round(web + 0.11 * length, 0.98 * half[0]), _round(length, end)]
     return _capsule(sections, 10, (base, end))
 
 

@@ -33,12 +33,7 @@ COLOURS = {"skin": (0.87, 0.67, 0.56)}
 # Joint limits [deg]; the README states their sources.
 ROOT_LIMITS = {"z": (-180, 180), "x": (-90, 90), "y": (-180, 180)}
 WRIST_LIMITS = {"flexion": (-70, 80), "deviation": (-20, 35)}
-ABDUCTION_LIMITS = {
-    "index": (-15, 30),
-    "middle": (-20, 20),
-    "ring": (-15, 25),
-    "little": (-15, 45),
-}
+ABDUCTION_LIMITS = {"index": (-15, 30), "middle": (-20, 20), "ring": (-15, 25), "little": (-15, 45)}
 FLEXION_LIMITS = {"mcp": (-30, 90), "pip": (-10, 110), "dip": (-10, 90)}
 THUMB_LIMITS = {
     "cmc_flexion": (-40, 40),

@@ -38,10 +38,7 @@ LIMBS: dict[str, tuple[str, Limits]] = {
 # Joints of person_shape.urdf alone, on the left side.
 WAIST: Limits = (("y", -45, 45), ("z", -35, 35), ("x", -60, 30))
 CLAVICLE: Limits = (("z", -10, 20), ("y", -20, 20))
-WELDED: dict[str, Limits] = {
-    "hand": (("z", -80, 70), ("x", -20, 30)),
-    "foot": (("x", -20, 50),),
-}
+WELDED: dict[str, Limits] = {"hand": (("z", -80, 70), ("x", -20, 30)), "foot": (("x", -20, 50),)}
 WAIST_HEIGHT = 0.6  # of the waist under the neck's base, as a fraction of the way to the hips
 STERNUM = (0.02, 0.0, 0.0)  # left clavicle's inner end from the neck's base [m]
 AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}

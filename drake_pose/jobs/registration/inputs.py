@@ -11,12 +11,7 @@ import numpy as np
 from drake_pose.arrays import Array, Picture
 from drake_pose.body import ArticulatedModel, PoseTree, load_model
 from drake_pose.body.tree_kinematics import TreeKinematics
-from drake_pose.camera.camera_files import (
-    CameraFile,
-    intrinsics_of,
-    load_camera_file,
-    load_cameras,
-)
+from drake_pose.camera.camera_files import CameraFile, intrinsics_of, load_camera_file, load_cameras
 from drake_pose.camera.episode import JointLog, Stream
 from drake_pose.camera.episode_files import JOINT_TABLE, open_episode, require_recording
 from drake_pose.camera.models import Camera, Lens, PinholeCamera

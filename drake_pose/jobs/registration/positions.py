@@ -31,10 +31,7 @@ from drake_pose.files.records import base_pose
 from drake_pose.files.settings import AuditSettings, EstimateSettings, RegistrationSettings
 from drake_pose.fit.parameters import carried_joints
 from drake_pose.jobs.estimate.inputs import make_tree, missing_for_person
-from drake_pose.jobs.estimate.measurements import (
-    read_measured_positions,
-    with_leaders,
-)
+from drake_pose.jobs.estimate.measurements import read_measured_positions, with_leaders
 from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.person.pose_tracker import shape_parts
 from drake_pose.registration.joint_offsets import KinematicParameter
@@ -102,10 +99,7 @@ def put_on_base(model: ArticulatedModel, table: JointLog) -> tuple[ArticulatedMo
 
 
 def read_known_positions(
-    path: Path,
-    kinematics: TreeKinematics,
-    unobserved: bool = False,
-    table: JointLog | None = None,
+    path: Path, kinematics: TreeKinematics, unobserved: bool = False, table: JointLog | None = None
 ) -> KnownPositions:
     """Return the positions in a table with columns for the frame and each joint that is not held.
 

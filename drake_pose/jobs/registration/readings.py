@@ -311,12 +311,7 @@ def _rotations() -> dict[str, Callable[[Array], Array]]:
 
 
 def likeliest_reading(
-    given: Array,
-    found: Array,
-    distance: float,
-    *,
-    near: float = 0.15,
-    least: float = 0.05,
+    given: Array, found: Array, distance: float, *, near: float = 0.15, least: float = 0.05
 ) -> tuple[str, float, float] | None:
     """Return the reading of a given pose that brings it near the pose that was found.
 

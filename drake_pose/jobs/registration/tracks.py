@@ -391,10 +391,7 @@ def describe_given(result: TrackRegistration, given: PinholeCamera) -> str:
 
 
 def draw_tracks(
-    folder: Path,
-    result: TrackRegistration,
-    given: PinholeCamera | None = None,
-    prefix: str = "",
+    folder: Path, result: TrackRegistration, given: PinholeCamera | None = None, prefix: str = ""
 ) -> None:
     """Draw inlier points in blue and outliers in orange, in up to six pictures.
 

@@ -32,21 +32,13 @@ from drake_pose.jobs.registration.words import (
     few_frames_warning,
     mode_warnings,
     outlier_warnings,
-    parameter_warnings,
-    target_warnings,
     zero_warnings,
 )
 from drake_pose.registration.findings import Finding, FrameDiagnosis
-from drake_pose.registration.joint_offsets import KinematicParameter, undetermined
 from drake_pose.registration.picture_matches import Sightings
 from drake_pose.registration.posed_frames import PosedFrame
 from drake_pose.registration.recording import Recording, TimeOffset
-from drake_pose.registration.register import (
-    FrameMisfit,
-    RegisteredCamera,
-    RegistrationBody,
-    TargetPose,
-)
+from drake_pose.registration.register import FrameMisfit, RegisteredCamera, RegistrationBody
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.jobs.registration.arm_scenes import write_arm_scene
 from tests.registration.arm_pictures import errors, looking_at, shifted
@@ -108,30 +100,6 @@ def test_errors_of_single_frames_are_told() -> None:
     ):
         one = Finding(**({"kind": "", "name": "a", "pixels": 2.5} | fields))
         assert re.search(said, describe_frame_finding(frame, one))
-
-
-def test_parameters_that_are_uncertain_are_named() -> None:
-    sure = KinematicParameter("a", 0.1, 0.01, 0.08, 0.12, True)
-    turning = replace(sure, name="b", deviation=2 * DEGREE, gauge=("turn_z",))
-    loose, alone = undetermined("c", ("turn_x",)), undetermined("d", ())
-    calibration = SimpleNamespace(offsets=(sure, loose), link_scales=(turning, alone))
-    texts = parameter_warnings(calibration)
-    for text, said in zip(texts, (
-        "^link 'b': its length is good to 2 degrees .* turn_z", "^joint 'c': .* not .* with turn_x",
-        "^link 'd': .* not changed; add",
-    ), strict=True):  # fmt: skip
-        assert re.search(said, text)
-    calibration.offsets, calibration.link_scales = (replace(sure, significant=False),), ()
-    (text,) = parameter_warnings(calibration)
-    assert "none of the requested" in text
-    assert weight_of(text) == "note"
-    assert parameter_warnings(SimpleNamespace(offsets=(), link_scales=())) == []
-    poses, axes = np.zeros((2, 4, 4)), np.eye(3)[2:]
-    texts = target_warnings(TargetPose(np.eye(4), np.eye(6), poses, axes))
-    assert [weight_of(one) for one in texts] == ["note"] * 2
-    assert "0.000, 0.000, 1.000" in texts[0]
-    assert "in 2 other poses" in texts[1]
-    assert target_warnings(TargetPose(np.eye(4), np.eye(6), poses[:0], axes[:0])) == []
 
 
 def test_outliers_are_told_with_their_suspects() -> None:

@@ -192,18 +192,18 @@ class TestFaces:
         with pytest.raises(SettingsError, match="three faces"):
             features.learn_faces([np.zeros((130, 80, 3), np.uint8)] * 2, np.zeros((2, 2)))
 
-    def test_head_angles_against_a_rotated_scene(self, studio):
-        camera = studio.cameras[FACE_CAMERA]
-        straight = np.array([0.0, 0.0, camera.X_WC[2, 3]])
-        direction = np.array([0.3, 0.2])
-        np.testing.assert_allclose(
-            features.head_angles(direction, straight, camera), direction, atol=1e-12
-        )
-        # A person beside the optical axis who looks into the camera has direction 0.
-        head = np.array([0.0, 0.8, camera.X_WC[2, 3] - 0.4])
-        looking = Rotation.from_euler("ZY", features.head_angles(np.zeros(2), head, camera))
-        towards = camera.X_WC[:3, 3] - head
-        np.testing.assert_allclose(np.cross(looking.apply([1, 0, 0]), towards), 0.0, atol=1e-12)
+    def test_head_angles_are_those_of_turns_in_the_world(self, studio):
+        """Ahead is the camera: by its azimuth and elevation, then the face's turn and nod."""
+        generator, camera = np.random.default_rng(4), studio.cameras[FACE_CAMERA]
+        for head in generator.uniform([-1.5, -1.5, 0.5], [1.5, 1.5, 3.0], (20, 3)):
+            direction = generator.uniform([-3.0, -1.5], [3.0, 1.5])
+            x, y, z = camera.X_WC[:3, 3] - head
+            ahead = Rotation.from_euler("ZY", [np.arctan2(y, x), -np.arctan2(z, np.hypot(x, y))])
+            looking = ahead * Rotation.from_euler("ZY", direction)
+            found = features.head_angles(direction, head, camera)
+            assert np.abs(found).max() <= np.pi
+            found = Rotation.from_euler("ZY", found).apply([1, 0, 0])
+            np.testing.assert_allclose(found, looking.apply([1, 0, 0]), atol=1e-12)
 
 
 @pytest.fixture(scope="module")

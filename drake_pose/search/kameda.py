@@ -93,11 +93,11 @@ class PaperSearch:
             run.search()
             runs = run.runs
             widest = all(r >= view.mask.size for r, view in zip(limits, views, strict=True))
-            spent = runs >= self.settings.run_limit
-            if run.best_J < np.inf or fixed is not None or widest or spent:
-                if spent and np.isinf(run.best_J) and fixed is None and not widest:
-                    # Wider thresholds would have been tried.
-                    run.stopped_by = "run_limit"
+            ended = run.best_J < np.inf or fixed is not None or widest
+            if not ended and runs >= self.settings.run_limit:
+                # Wider thresholds would have been tried.
+                run.stopped_by, ended = "run_limit", True
+            if ended:
                 return replace(run.result(), seconds=time.perf_counter() - start)
             limits = [2.0 * r for r in limits]
 

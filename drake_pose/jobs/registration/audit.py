@@ -220,10 +220,8 @@ def _find_on_links(
             findings.append(Finding("reading", text))
         warnings += track_warnings(result, name in inputs.assumed_focal)
         for one in result.found.frames:
-            ratios, text = (
-                {name: one.inlier_ratio},
-                f"{percent(one.inlier_ratio)} of its points fit",
-            )
+            ratios = {name: one.inlier_ratio}
+            text = f"{percent(one.inlier_ratio)} of its points fit"
             off = None if one.is_inlier else Finding("unexplained", name, text=text)
             frames.append(FrameDiagnosis(f"{name}-{one.frame}", ratios, ratios, 0.0, off))
     return tracks, frames, findings, warnings

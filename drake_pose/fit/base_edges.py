@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from drake_pose.arrays import Array, Floats, Mask, Picture
 from drake_pose.body.tree_kinematics import TreeKinematics
-from drake_pose.camera.models import PinholeCamera
+from drake_pose.camera.models import PinholeCamera, pose_matrix
 from drake_pose.compiled import compiled
 from drake_pose.silhouette.outline import EMPTY_OUTLINE, Outline
 from drake_pose.silhouette.scoring import draw_mask
@@ -88,10 +88,8 @@ def joint_rotation(kinematics: TreeKinematics, values: Array, joint: int, angle:
     twist = kinematics.motions(values).twists[joint]
     omega = twist[:3] / np.linalg.norm(twist[:3])
     place = np.cross(omega, twist[3:6])
-    X = np.eye(4)
-    X[:3, :3] = Rotation.from_rotvec(angle * omega).as_matrix()
-    X[:3, 3] = place - X[:3, :3] @ place
-    return X
+    R = Rotation.from_rotvec(angle * omega).as_matrix()
+    return pose_matrix(R, place - R @ place)
 
 
 def locate_base(

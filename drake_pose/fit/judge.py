@@ -13,6 +13,7 @@ import numpy as np
 from scipy.special import betainc, ndtri
 
 from drake_pose.arrays import Array, Floats, Mask
+from drake_pose.camera.models import pose_matrix
 
 LEVEL = 0.01
 """Significance level of all tests that decide what is true."""
@@ -178,7 +179,5 @@ def depth_twin(X_CW: Array, points: Array) -> Array:
     p_C = X_CW[:3, :3] @ middle + X_CW[:3, 3]
     ray = p_C / np.linalg.norm(p_C)
     D, S = (np.eye(3) - 2.0 * np.outer(one, one) for one in (ray, u))
-    twin = np.eye(4)
-    twin[:3, :3] = D @ X_CW[:3, :3] @ S
-    twin[:3, 3] = p_C - twin[:3, :3] @ middle
-    return twin
+    R = D @ X_CW[:3, :3] @ S
+    return pose_matrix(R, p_C - R @ middle)

@@ -25,7 +25,7 @@ from drake_pose.body import (
     join_meshes,
 )
 from drake_pose.body.tree_kinematics import TreeKinematics
-from drake_pose.camera.models import PinholeCamera
+from drake_pose.camera.models import PinholeCamera, pose_matrix
 from drake_pose.errors import RegistrationError, SettingsError
 from drake_pose.fit.background import KnownBackground
 from drake_pose.fit.judge import paired_evidence
@@ -132,9 +132,7 @@ class CalibrationTarget:
 
     def moved(self, X_WT: Array, by: Array) -> Array:
         """Return the target's pose (4, 4) at TARGET_POSITIONS `by` (6,), which are 0 at X_WT."""
-        X = np.eye(4)
-        X[:3, 3] = by[:3]
-        X[:3, :3] = Rotation.from_euler("XYZ", by[3:]).as_matrix()
+        X = pose_matrix(Rotation.from_euler("XYZ", by[3:]).as_matrix(), by[:3])
         return np.asarray(X_WT @ self._X_TO @ X @ inverse_transforms(self._X_TO))
 
     def pose_covariance(self, X_WT: Array, covariance: Array) -> Array:

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from drake_pose.arrays import Array
-from drake_pose.camera.models import Camera, PinholeCamera, inverse_pose
+from drake_pose.camera.models import Camera, PinholeCamera, inverse_pose, pose_matrix
 from drake_pose.fit.judge import LEVEL
 from drake_pose.fit.parameters import CAMERA_NAMES
 from drake_pose.registration.large_errors import Correction, unchanged
@@ -237,9 +237,8 @@ def _reread(
         R: (3, 3) rotation of the camera's axes, applied last.
         X: the matrix.
     """
-    reread = np.eye(4)
-    reread[:3, :3], reread[:3, 3] = turn(X[:3, :3]), unit * X[:3, 3]
-    reread = inverse_pose(reread).copy() if inverse else reread
+    reread = pose_matrix(turn(X[:3, :3]), unit * X[:3, 3])
+    reread = inverse_pose(reread) if inverse else reread
     reread[:3, :3] = reread[:3, :3] @ R
     return reread
 
